@@ -1,0 +1,38 @@
+"""SAUNA: PPO whose updates keep only the transitions with an informative explained variance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sauna.api import Result, load, resume, train
+    from sauna.errors import BadInput, SaunaError
+    from sauna.evaluate import evaluate
+    from sauna.selection.filters import Filter
+    from sauna.selection.vex import VexTarget
+
+__version__ = "0.1.0"
+
+__all__ = ["BadInput", "Filter", "Result", "SaunaError", "VexTarget", "evaluate", "load",
+           "resume", "train"]  # fmt: skip
+
+_HOMES = {
+    "BadInput": "sauna.errors",
+    "SaunaError": "sauna.errors",
+    "Result": "sauna.api",
+    "load": "sauna.api",
+    "resume": "sauna.api",
+    "train": "sauna.api",
+    "evaluate": "sauna.evaluate",
+    "Filter": "sauna.selection.filters",
+    "VexTarget": "sauna.selection.vex",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Public names are imported when first used, so that the command line starts without JAX."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'sauna' has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_HOMES[name]), name)

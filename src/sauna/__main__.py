@@ -1,0 +1,3 @@
+from sauna.cli import main
+
+main()

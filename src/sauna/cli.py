@@ -1,0 +1,226 @@
+"""The command line: `sauna train | resume | eval | list`.
+
+Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
+starts in milliseconds, and a mistake can be answered with one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from pathlib import Path
+from typing import Any, NoReturn
+
+from sauna import __version__
+from sauna.config import FIELDS, FILTERS, TYPES, VEX_TARGETS, flag
+from sauna.errors import BadInput, Interrupted, SaunaError, nearest
+from sauna.presets import ARM_HELP, PRESET_HELP, given_by
+
+LISTS = ("envs", "arms", "presets", "filters", "targets")
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise BadInput(message)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="sauna", description=__doc__.splitlines()[0] if __doc__ else None,
+                     allow_abbrev=False)  # fmt: skip
+    parser.add_argument("--version", action="version", version=f"sauna {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+
+    train = commands.add_parser("train", help="train a population", allow_abbrev=False)
+    train.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
+    train.add_argument("--config", metavar="FILE", help="settings of a run's config.json")
+    _add_fields(train, [name for name in FIELDS if name != "env"])
+
+    resume = commands.add_parser("resume", help="continue a run", allow_abbrev=False)
+    resume.add_argument("run", metavar="RUN", help="run directory")
+    resume.add_argument("--inexact", action="store_true",
+                        help="start new episodes where environments cannot be brought back")  # fmt: skip
+    from sauna.run import RESUMABLE
+
+    _add_fields(resume, list(RESUMABLE))
+
+    evaluate = commands.add_parser("eval", help="play episodes with a trained run",
+                                   allow_abbrev=False)  # fmt: skip
+    evaluate.add_argument("run", metavar="RUN", help="run directory")
+    evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
+    evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
+    evaluate.add_argument("--deterministic", action="store_true",
+                          help="the most likely action (default: sampled, as in training)")  # fmt: skip
+    evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
+    evaluate.add_argument("--env", help="another environment with the same spaces")
+    evaluate.add_argument("--video", action="store_true", help="film the first episode")
+
+    lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
+    lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
+    return parser
+
+
+def _add_fields(parser: argparse.ArgumentParser, names: list[str]) -> None:
+    for name in names:
+        field = FIELDS[name]
+        text = field.metadata["help"].replace("%", "%%")
+        if field.metadata["choices"]:
+            text += f" [{', '.join(field.metadata['choices'])}]"
+        default = field.default
+        if isinstance(default, tuple):
+            default = ",".join(map(str, default))
+        text += "" if default == "" else f" (default {default})"
+        if TYPES[name] is bool:
+            action = argparse.BooleanOptionalAction
+            parser.add_argument(flag(name), action=action, default=argparse.SUPPRESS, help=text)
+        else:
+            parser.add_argument(flag(name), default=argparse.SUPPRESS, help=text, metavar="VALUE")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Parses, runs, and exits with the documented code."""
+    try:
+        _run(sys.argv[1:] if arguments is None else arguments)
+    except BadInput as error:
+        _fail(error, 2)
+    except Interrupted as error:
+        _fail(error, 128 + error.signal_number)
+    except SaunaError as error:
+        _fail(error, 1)
+    except KeyboardInterrupt:
+        _fail("interrupted", 130)
+    except BrokenPipeError:
+        sys.exit(1)
+    except Exception as error:
+        traceback.print_exc()
+        _fail(f"unexpected {type(error).__name__}: {error}", 1)
+
+
+def _fail(message: object, code: int) -> NoReturn:
+    print(f"sauna: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _run(arguments: list[str]) -> None:
+    parser = make_parser()
+    parsed, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        flags = [option for action in _subparser(parser, parsed.command)._actions
+                 for option in action.option_strings]  # fmt: skip
+        raise BadInput(f"unknown argument {unknown[0]!r}{nearest(unknown[0].split('=')[0], flags)}")
+    values = {name: value for name, value in vars(parsed).items() if name != "command"}
+    if parsed.command is None:
+        parser.print_help()
+    else:
+        {"train": _train, "resume": _resume, "eval": _eval, "list": _list}[parsed.command](values)
+
+
+def _subparser(parser: argparse.ArgumentParser, command: str | None) -> argparse.ArgumentParser:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction) and command:
+            return action.choices[command]
+    return parser
+
+
+def _train(values: dict[str, Any]) -> None:
+    from sauna import run as runs
+    from sauna.metrics.display import make_display
+
+    given = _given_from(values.pop("config"))
+    env = values.pop("env")
+    given |= values | ({"env": env} if env else {})
+    display = make_display()
+    run = runs.start(given, display)
+    runs.train(run, display, resume=False)
+    print(f"learning curve: {run.path}/figures/learning_curve.png")
+
+
+def _given_from(file: str | None) -> dict[str, Any]:
+    """Settings of a `config.json` (of a run), or of a JSON file of plain settings."""
+    if file is None:
+        return {}
+    from sauna.rundir import read_config_file
+
+    stored = read_config_file(Path(file))
+    if "config" in stored and "given" in stored:
+        return given_by(stored["config"], stored["given"])
+    return stored
+
+
+def _resume(values: dict[str, Any]) -> None:
+    from sauna import run as runs
+    from sauna.metrics.display import make_display
+
+    path, inexact = Path(values.pop("run")), values.pop("inexact")
+    display = make_display()
+    run = runs.reopen(path, values, display)
+    runs.train(run, display, resume=True, inexact=inexact)
+
+
+def _eval(values: dict[str, Any]) -> None:
+    from sauna.rundir import read_config
+
+    run = Path(values.pop("run"))
+    for name, least in (("episodes", 1), ("seed", 0)):
+        if not values[name].isdigit() or int(values[name]) < least:
+            raise BadInput(f"{name}: must be a whole number of at least {least}")
+        values[name] = int(values[name])
+    read_config(run)
+    from sauna.evaluate import choose_renderer
+    from sauna.worker import configure_jax
+
+    if values["video"]:
+        choose_renderer()
+    configure_jax()
+    from sauna.evaluate import evaluate
+
+    result = evaluate(run, **values)
+    print(f"{result['env']}, {result['mode']} actions, frozen normaliser, "
+          f"checkpoint of iteration {result['iteration']}")  # fmt: skip
+    for name, row in result["members"].items():
+        print(f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
+              f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
+              f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
+              f"{row['episodes']} episodes")  # fmt: skip
+    if "video" in result:
+        print(f"video: {result['video']}")
+
+
+def _list(values: dict[str, Any]) -> None:
+    what = values["what"]
+    if what == "envs":
+        import gymnasium
+
+        for name in sorted(gymnasium.registry):
+            print(name)
+    else:
+        known = {"arms": ARM_HELP, "presets": PRESET_HELP,
+                 "filters": FILTER_HELP, "targets": TARGET_HELP}[what]  # fmt: skip
+        width = max(map(len, known))
+        for name, text in known.items():
+            print(f"{name:{width}}  {text}")
+
+
+FILTER_HELP = dict(
+    zip(
+        FILTERS,
+        (
+            "keep everything",
+            "keep where |Vex| / |median of earlier Vex| reaches the threshold (eq. 7)",
+            "drop at random at a given rate",
+        ),
+        strict=True,
+    )
+)
+TARGET_HELP = dict(
+    zip(
+        VEX_TARGETS,
+        (
+            "eq. 5 over one actor's rollout, one number for all its states (the paper)",
+            "1 - Var(R - V) / Var(R) over each minibatch (the released code)",
+            "eq. 5 over each stretch of one episode",
+            "each state's own share of eq. 5",
+        ),
+        strict=True,
+    )
+)

@@ -1,0 +1,105 @@
+"""The policy of one member: its network and action distribution, as functions of flat parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from sauna.config import Config, import_name
+from sauna.core.distributions import Distribution, bernoulli, gaussian, multi_categorical
+from sauna.core.networks import MLP, ActorCritic, NatureCNN
+from sauna.core.types import Array, Params, PolicyOutput
+from sauna.errors import BadInput
+from sauna.spaces import Spaces
+
+
+class Policy(NamedTuple):
+    """Pure functions of one member's flat parameters `[D]`.
+
+    Attributes:
+      init: `key -> params [D]`.
+      apply: `(params, observation [..., *obs]) -> PolicyOutput`.
+      unravel: `params [D] -> the flax parameter pytree`.
+      distribution: of the actions.
+    """
+
+    init: Callable[[Array], Array]
+    apply: Callable[[Array, Array], PolicyOutput]
+    unravel: Callable[[Array], Params]
+    distribution: Distribution
+
+
+def make_distribution(spaces: Spaces) -> Distribution:
+    if spaces.action_kind == "continuous":
+        return gaussian(spaces.action_sizes[0])
+    if spaces.action_kind == "multi_binary":
+        return bernoulli(spaces.action_sizes[0])
+    return multi_categorical(spaces.action_sizes)
+
+
+def make_trunk(config: Config, spaces: Spaces) -> Callable[[str], nn.Module]:
+    """A function that builds the trunk `config.network` names.
+
+    Raises:
+      BadInput: a user's `module:name` is not a flax module or a function that returns one.
+    """
+    if config.network == "mlp":
+        return partial(_named, MLP, hidden=config.hidden, activation=config.activation)
+    if config.network == "nature-cnn":
+        return partial(_named, NatureCNN)
+    make = import_name("network", config.network)
+    if isinstance(make, nn.Module):
+        return lambda name: make.clone(name=name)
+    if isinstance(make, type) and issubclass(make, nn.Module):
+        return partial(_named, make)
+    raise BadInput(f"network: {config.network} is not a flax.linen module")
+
+
+def _named(module: Callable[..., nn.Module], name: str, **settings: Any) -> nn.Module:
+    return module(name=name, **settings)
+
+
+def make_policy(config: Config, spaces: Spaces) -> Policy:
+    """The policy that `config` describes for environments with these `spaces`."""
+    distribution = make_distribution(spaces)
+    network = ActorCritic(
+        make_trunk(config, spaces),
+        distribution.num_outputs,
+        config.log_std_init if distribution.has_log_std else None,
+        config.trunk == "shared",
+    )
+    example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
+    shapes = jax.eval_shape(network.init, jax.random.key(0), example)
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    unravel = ravel_pytree(zeros)[1]
+
+    def init(key: Array) -> Array:
+        return ravel_pytree(network.init(key, example))[0]
+
+    def apply(params: Array, observation: Array) -> PolicyOutput:
+        return network.apply(unravel(params), observation)  # type: ignore[return-value]
+
+    return Policy(init, apply, unravel, distribution)
+
+
+def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Array:
+    """Acts once in the N envs of a member.
+
+    Args:
+      observation: `[N, *obs]` normalised; noise: `[N, M]` from `distribution.draw`.
+
+    Returns:
+      `[N, A + 3]` float32: action, log_prob, value, vex side by side, so that the host fetches one
+      array. Integer actions below 2^24 are exact in it.
+    """
+    output = policy.apply(params, observation)
+    action = policy.distribution.sample(output.policy, noise)
+    log_prob = policy.distribution.log_prob(output.policy, action)
+    columns = [log_prob[:, None], output.value[:, None], output.vex[:, None]]
+    return jnp.concatenate([action.astype(jnp.float32), *columns], -1)

@@ -1,0 +1,99 @@
+"""The members' axis. Everything else in `core/` is written for one member."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sauna.config import Config
+from sauna.core.batch import make_batch
+from sauna.core.policy import Policy, act, make_policy
+from sauna.core.types import Array, Batch, Hypers, Rollout, TrainState
+from sauna.core.update import UpdateMetrics, init_state, learn
+from sauna.selection.filters import Filter, decide, make_filter
+from sauna.selection.vex import make_target
+from sauna.spaces import Spaces
+
+
+class Program(NamedTuple):
+    """The compiled functions of one static config.
+
+    `act` takes a leading member axis `P` on every argument; the others take one member. On CPU a
+    member's numbers must not depend on its neighbours, so members are never batched into one
+    matrix product: `act` maps over them, and updates are called one by one.
+    """
+
+    config: Config
+    policy: Policy
+    filter: Filter | None
+    init: Callable[[Array], TrainState]
+    draw: Callable[[Array, Array, Array], Array]
+    act: Callable[[Array, Any, Any], Array]
+    value: Callable[[Array, Any], Array]
+    decide: Callable[..., tuple[Any, Array]]
+    make_batch: Callable[[Rollout, Hypers], Batch]
+    learn: Callable[[TrainState, Rollout, Batch, Hypers, Array], tuple[TrainState, UpdateMetrics]]
+
+
+def map_members(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of one member, over a leading axis of members.
+
+    On CPU a `lax.map`: a batched product rounds differently for 6 members than for 1, and training
+    amplifies the difference. On accelerators a `vmap`, where members agree to rounding only.
+    """
+    if jax.default_backend() == "cpu":
+        return lambda *arguments: jax.lax.map(lambda x: function(*x), arguments)
+    return jax.vmap(function)
+
+
+def stack(trees: Sequence[Any]) -> Any:
+    """Members' pytrees -> one pytree with a leading member axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def make_program(config: Config, spaces: Spaces) -> Program:
+    """Builds (without compiling) everything that members with this static config run."""
+    policy, target = make_policy(config, spaces), make_target(config)
+    filter = make_filter(config)
+    shape = (config.rollout_steps, config.envs)
+
+    def draw(root: Array, iteration: Array, block: Array) -> Array:
+        key = jax.random.fold_in(jax.random.fold_in(root, iteration), block)
+        return policy.distribution.draw(key, shape)
+
+    return Program(
+        config=config,
+        policy=policy,
+        filter=filter,
+        init=jax.jit(partial(init_state, policy)),
+        draw=jax.jit(draw),
+        act=jax.jit(map_members(partial(act, policy))),
+        value=jax.jit(lambda params, observation: policy.apply(params, observation).value),
+        decide=jax.jit(partial(decide, filter)) if filter else _nothing_to_decide,
+        make_batch=jax.jit(partial(make_batch, config=config, target=target)),
+        learn=jax.jit(
+            partial(learn, config=config, policy=policy, target=target), donate_argnums=(0,)
+        ),
+    )
+
+
+def _nothing_to_decide(*arguments: Any) -> tuple[Any, Array]:
+    raise AssertionError("a program without a filter keeps every step")
+
+
+class Keys(NamedTuple):
+    """The JAX keys of one member; each use folds in the iteration, so that no key is stored."""
+
+    init: Array
+    action: Array
+    filter: Array
+    minibatch: Array
+
+
+def member_keys(seed: int) -> Keys:
+    """Keys that depend on the member's seed alone."""
+    return Keys(*jax.random.split(jax.random.key(seed), 4))

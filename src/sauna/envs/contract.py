@@ -1,0 +1,52 @@
+"""What every host backend is: M environments stepped together, each of them restorable.
+
+Resets happen inside `step`: where an episode ends, the returned observation is the first of the
+next episode and `final_observation` holds the one that the ended episode really reached.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+Snapshot = dict[str, np.ndarray]
+
+
+class Step(NamedTuple):
+    """One env step of M environments. Rows of environments that were not active are meaningless."""
+
+    observation: np.ndarray  # [M, *obs] what the policy sees next
+    reward: np.ndarray  # [M] float64
+    terminated: np.ndarray  # [M] bool
+    truncated: np.ndarray  # [M] bool, never together with terminated
+    final_observation: np.ndarray  # [M, *obs], meaningful where an episode ended
+
+
+class HostEnvs(Protocol):
+    """M environments behind one interface."""
+
+    def reset(self) -> np.ndarray:
+        """Starts episode 0 everywhere; observations `[M, *obs]`."""
+
+    def step(self, action: np.ndarray, active: np.ndarray) -> Step:
+        """Steps the active environments (`[M]` bool) with actions `[M, A]`, unclipped.
+
+        Raises:
+          EnvironmentFailure: an environment raised, returned non-finite numbers, or its worker
+            died; the message names it.
+        """
+
+    def snapshot(self, index: int) -> Snapshot:
+        """All that is needed to bring environment `index` back to where it is."""
+
+    def restore(self, index: int, snapshot: Snapshot) -> np.ndarray:
+        """Brings environment `index` to a snapshot's state; its observation `[*obs]` there."""
+
+    def close(self) -> None: ...
+
+
+def episode_seed(member_seed: int, env_index: int, episode: int) -> int:
+    """The seed that an episode is reset with: a function of nothing but these three."""
+    sequence = np.random.SeedSequence([member_seed, env_index, episode])
+    return int(sequence.generate_state(1)[0])

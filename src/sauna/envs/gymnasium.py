@@ -1,0 +1,172 @@
+"""Any Gymnasium environment as a host backend.
+
+An environment is restored by replaying: its episode's seed and the actions since the reset are
+the snapshot. That is exact for every environment that is deterministic given them, which
+`probe.py` checks before a run starts.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sauna.config import import_name
+from sauna.envs.contract import HostEnvs, Snapshot, Step, episode_seed
+from sauna.errors import BadInput, SaunaError, nearest
+from sauna.spaces import action_writer, describe, observation_reader
+
+_GYMNASIUM_ID = re.compile(r"^(?:[\w.-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
+
+
+class EnvironmentFailure(SaunaError):
+    """An environment raised, or gave numbers that cannot be learned from."""
+
+
+def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
+    """A function that makes the environment; it takes further keywords such as `render_mode`.
+
+    `env` is a Gymnasium id (also `module:Id-v0`, importing the module first) or `module:function`.
+
+    Raises:
+      BadInput: there is no such environment; the nearest known id is named.
+    """
+    if ":" in env and not _GYMNASIUM_ID.match(env):
+        function = import_name("env", env)
+        return lambda **more: function(**env_kwargs, **more)
+    import gymnasium
+
+    module, _, name = env.rpartition(":")
+    if module:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise BadInput(f"env: cannot import {module!r}: {error}") from error
+    if name not in gymnasium.registry:
+        raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
+    return lambda **more: gymnasium.make(name, disable_env_checker=True, **env_kwargs, **more)
+
+
+def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
+    """One environment, or a `BadInput` that says why it cannot be made."""
+    maker = env_maker(env, env_kwargs)
+    try:
+        return maker(**more)
+    except Exception as error:  # whatever a user's environment raises when made
+        raise BadInput(f"env: {env} cannot be made: {_one_line(error)}") from error
+
+
+def _one_line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".replace("\n", " ")[:300]
+
+
+class _Slot:
+    """One environment, its running episode, and the actions taken in it."""
+
+    __slots__ = ("actions", "env", "episode", "name", "seeds")
+
+    def __init__(self, env: Any, seeds: tuple[int, int]) -> None:
+        self.env, self.seeds, self.episode = env, seeds, -1
+        self.actions: list[np.ndarray] = []
+        self.name = f"environment {seeds[1]} of seed {seeds[0]}"
+
+
+class GymnasiumEnvs(HostEnvs):
+    """M Gymnasium environments stepped one after the other in this process.
+
+    Args:
+      make: makes one environment.
+      seeds: `(member seed, env index)` of each environment.
+    """
+
+    def __init__(self, make: Callable[[], Any], seeds: Sequence[tuple[int, int]]) -> None:
+        self._slots = [_Slot(make(), pair) for pair in seeds]
+        env = self._slots[0].env
+        self.spaces = describe(env.observation_space, env.action_space)
+        self._read = observation_reader(env.observation_space)
+        self._write = action_writer(env.action_space)
+        number, shape = len(self._slots), self.spaces.observation_shape
+        dtype = np.uint8 if self.spaces.observation_kind == "image" else np.float64
+        self._observation = np.zeros((number, *shape), dtype)
+        self._final = np.zeros((number, *shape), dtype)
+        self._reward = np.zeros(number)
+        self._terminated = np.zeros(number, bool)
+        self._truncated = np.zeros(number, bool)
+
+    def reset(self) -> np.ndarray:
+        for index, slot in enumerate(self._slots):
+            slot.episode = -1
+            self._start_episode(index, slot)
+        return self._observation.copy()
+
+    def _start_episode(self, index: int, slot: _Slot) -> None:
+        slot.episode += 1
+        slot.actions = []
+        try:
+            observation, _ = slot.env.reset(seed=episode_seed(*slot.seeds, slot.episode))
+        except Exception as error:
+            raise EnvironmentFailure(f"{slot.name}: reset raised {_one_line(error)}") from error
+        self._observation[index] = self._read(observation)
+
+    def step(self, action: np.ndarray, active: np.ndarray) -> Step:
+        self._terminated[:] = False
+        self._truncated[:] = False
+        for index in np.flatnonzero(active):
+            self._step_one(index, self._slots[index], action[index])
+        self._check_finite(active)
+        return Step(
+            self._observation, self._reward, self._terminated, self._truncated, self._final
+        )
+
+    def _step_one(self, index: int, slot: _Slot, action: np.ndarray) -> None:
+        slot.actions.append(action)
+        try:
+            observation, reward, terminated, truncated, _ = slot.env.step(self._write(action))
+        except Exception as error:
+            raise EnvironmentFailure(f"{slot.name}: step raised {_one_line(error)}") from error
+        self._reward[index] = reward
+        if terminated or truncated:
+            self._terminated[index] = terminated
+            self._truncated[index] = truncated and not terminated
+            self._final[index] = self._read(observation)
+            self._start_episode(index, slot)
+        else:
+            self._observation[index] = self._read(observation)
+
+    def _check_finite(self, active: np.ndarray) -> None:
+        """One sum tells whether anything is amiss; only then the culprit is looked for."""
+        if np.isfinite(self._observation.sum() + self._final.sum() + self._reward.sum()):
+            return
+        for index in np.flatnonzero(active):
+            slot = self._slots[index]
+            where = f"{slot.name}, episode {slot.episode}, step {len(slot.actions)}"
+            if not np.isfinite(self._reward[index]):
+                raise EnvironmentFailure(f"{where}: reward is {self._reward[index]}")
+            for row in (self._observation[index], self._final[index]):
+                if not np.isfinite(row).all():
+                    component = int(np.flatnonzero(~np.isfinite(row))[0])
+                    value = row.reshape(-1)[component]
+                    raise EnvironmentFailure(f"{where}: observation[{component}] is {value}")
+
+    def snapshot(self, index: int) -> Snapshot:
+        slot = self._slots[index]
+        width = (len(slot.actions), self.spaces.action_width)
+        actions = np.asarray(slot.actions, self.spaces.action_dtype).reshape(width)
+        return {"episode": np.asarray(slot.episode), "actions": actions}
+
+    def restore(self, index: int, snapshot: Snapshot) -> np.ndarray:
+        slot = self._slots[index]
+        slot.episode = int(snapshot["episode"]) - 1
+        self._start_episode(index, slot)
+        for action in snapshot["actions"]:
+            slot.actions.append(action)
+            observation = slot.env.step(self._write(action))[0]
+            self._observation[index] = self._read(observation)
+        return self._observation[index].copy()
+
+    def close(self) -> None:
+        for slot in self._slots:
+            slot.env.close()

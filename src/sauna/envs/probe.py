@@ -1,0 +1,63 @@
+"""What is learned of an environment before a run starts: its spaces, and whether it repeats."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sauna.envs.gymnasium import make_env
+from sauna.spaces import Spaces, describe, observation_reader
+
+STEPS = 25
+
+
+class Probe(NamedTuple):
+    """`repeats` is None where the environment gave the same episode twice, else what differed."""
+
+    spaces: Spaces
+    differs: str | None
+
+
+def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
+    """Makes the environment twice and plays the same seed and actions in both.
+
+    One of the two has played another episode before, so that a state which survives a reset is
+    seen too.
+
+    Raises:
+      BadInput: the environment cannot be made, or its spaces are not supported.
+    """
+    first, second = make_env(env, env_kwargs), make_env(env, env_kwargs)
+    try:
+        spaces = describe(first.observation_space, first.action_space)
+        _play(first, seed=1)
+        differs = _difference(_play(first, seed=2), _play(second, seed=2))
+    finally:
+        first.close()
+        second.close()
+    return Probe(spaces, differs)
+
+
+def _play(env: Any, seed: int) -> list[tuple[np.ndarray, float, bool]]:
+    """`STEPS` steps of random actions: `(observation, reward, ended)` of each."""
+    read = observation_reader(env.observation_space)
+    env.action_space.seed(seed)
+    seen = [(np.array(read(env.reset(seed=seed)[0])), 0.0, False)]
+    for _ in range(STEPS):
+        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        seen.append((np.array(read(observation)), float(reward), bool(terminated or truncated)))
+        if seen[-1][2]:
+            break
+    return seen
+
+
+def _difference(
+    one: list[tuple[np.ndarray, float, bool]], other: list[tuple[np.ndarray, float, bool]]
+) -> str | None:
+    for step, (a, b) in enumerate(zip(one, other, strict=False)):
+        if not np.array_equal(a[0], b[0], equal_nan=True):
+            return f"observations differ at step {step} of an episode played twice"
+        if a[1:] != b[1:]:
+            return f"rewards or episode ends differ at step {step} of an episode played twice"
+    return None

@@ -1,0 +1,122 @@
+"""Host environments in worker processes: the same contract, for environments that are slow."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sauna.envs.contract import HostEnvs, Snapshot, Step
+from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
+from sauna.errors import SaunaError
+from sauna.spaces import Spaces
+from sauna.wire import Message, Worker, child_ends, receive, send, start_worker
+
+
+class ProcessEnvs(HostEnvs):
+    """M environments split over worker processes; a step of all workers runs at the same time.
+
+    Args:
+      env, env_kwargs: what each worker makes.
+      seeds: `(member seed, env index)` of each environment.
+      processes: number of workers.
+      timeout: seconds after which a silent worker counts as hung.
+    """
+
+    def __init__(
+        self,
+        env: str,
+        env_kwargs: dict[str, Any],
+        seeds: Sequence[tuple[int, int]],
+        processes: int,
+        timeout: float,
+    ) -> None:
+        self._timeout = timeout
+        self._parts = np.array_split(np.arange(len(seeds)), processes)
+        # BLAS and XLA threads of a worker would only compete with its siblings for cores.
+        self._workers = [start_worker(__name__, {"OMP_NUM_THREADS": "1"}) for _ in self._parts]
+        for worker, part in zip(self._workers, self._parts, strict=True):
+            chosen = [list(seeds[i]) for i in part]
+            worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen})
+        answers = [self._answer(number) for number in range(processes)]
+        fields = answers[0].header["spaces"]
+        self.spaces = Spaces(*(tuple(f) if isinstance(f, list) else f for f in fields))
+
+    def reset(self) -> np.ndarray:
+        for worker in self._workers:
+            worker.say({"kind": "reset"})
+        return np.concatenate(
+            [self._answer(k).arrays["observation"] for k in range(len(self._workers))]
+        )
+
+    def step(self, action: np.ndarray, active: np.ndarray) -> Step:
+        for worker, part in zip(self._workers, self._parts, strict=True):
+            worker.say({"kind": "step"}, {"action": action[part], "active": active[part]})
+        answers = [self._answer(number).arrays for number in range(len(self._workers))]
+        return Step(*(np.concatenate([a[name] for a in answers]) for name in Step._fields))
+
+    def snapshot(self, index: int) -> Snapshot:
+        number, local = self._find(index)
+        self._workers[number].say({"kind": "snapshot", "index": local})
+        return self._answer(number).arrays
+
+    def restore(self, index: int, snapshot: Snapshot) -> np.ndarray:
+        number, local = self._find(index)
+        self._workers[number].say({"kind": "restore", "index": local}, snapshot)
+        return self._answer(number).arrays["observation"]
+
+    def close(self) -> None:
+        for worker in self._workers:
+            worker.stop()
+
+    def _find(self, index: int) -> tuple[int, int]:
+        number = next(k for k, part in enumerate(self._parts) if index in part)
+        return number, int(index - self._parts[number][0])
+
+    def _answer(self, number: int) -> Message:
+        worker = self._workers[number]
+        name = f"environment worker {number} (process {worker.process.pid})"
+        if not worker.inbox.poll(self._timeout):
+            worker.process.kill()
+            raise EnvironmentFailure(f"{name} did not answer within {self._timeout:g} s")
+        try:
+            message = receive(worker.inbox)
+        except EOFError:
+            code = worker.process.wait()
+            raise EnvironmentFailure(f"{name} ended with exit code {code}") from None
+        if message.header["kind"] == "failure":
+            raise EnvironmentFailure(f"{name}: {message.header['message']}")
+        return message
+
+
+def _serve(envs: GymnasiumEnvs, message: Message) -> dict[str, np.ndarray]:
+    kind, arrays = message.header["kind"], message.arrays
+    if kind == "reset":
+        return {"observation": envs.reset()}
+    if kind == "step":
+        return envs.step(arrays["action"], arrays["active"])._asdict()
+    if kind == "snapshot":
+        return envs.snapshot(message.header["index"])
+    return {"observation": envs.restore(message.header["index"], arrays)}
+
+
+def main() -> None:
+    """The worker: makes its environments, then answers until its inbox closes."""
+    inbox, outbox = child_ends(sys.argv[1:])
+    try:
+        header = receive(inbox).header
+        make = env_maker(header["env"], header["kwargs"])
+        envs = GymnasiumEnvs(make, [(int(a), int(b)) for a, b in header["seeds"]])
+        send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
+        while True:
+            send(outbox, {"kind": "answer"}, _serve(envs, receive(inbox)))
+    except (EOFError, BrokenPipeError):
+        return
+    except SaunaError as error:
+        send(outbox, {"kind": "failure", "message": str(error)})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""What can go wrong, as types that the command line turns into exit codes."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SaunaError(Exception):
+    """Something failed for a reason that can be named in one line (exit code 1)."""
+
+
+class BadInput(SaunaError):
+    """The user asked for something that cannot be done (exit code 2, nothing created)."""
+
+
+class Interrupted(SaunaError):
+    """A signal stopped the run after its state was saved (exit code 128 + signal)."""
+
+    def __init__(self, signal_number: int, message: str) -> None:
+        super().__init__(message)
+        self.signal_number = signal_number
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`; did you mean X?` for the known word closest to `word`, or an empty string."""
+    found = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f"; did you mean {found[0]!r}?" if found else ""

@@ -1,0 +1,158 @@
+"""The whole state of a member as named arrays, and back.
+
+Everything that a resumed run needs is here or follows from the seed and the iteration: JAX keys
+are folded from them, environments are replayed from their episode's seed and actions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+
+from sauna.collect.host import Collected, HostCollector
+from sauna.core.normalize import Moments
+from sauna.core.policy import Policy
+from sauna.core.types import TrainState
+from sauna.envs.contract import HostEnvs
+from sauna.errors import SaunaError
+
+WINDOW = 100  # episodes that the reported mean return covers, as in baselines and the paper
+
+
+class NotRestored(SaunaError):
+    """An environment did not come back to where the checkpoint says it was."""
+
+
+@dataclass
+class Counters:
+    """What a member has done so far."""
+
+    env_steps: int = 0
+    kept_steps: int = 0
+    episodes: int = 0
+    recent_returns: list[float] = field(default_factory=list)  # of the last `WINDOW` episodes
+    reported_returns: list[float] = field(default_factory=list)  # those that ended on a kept step
+
+    def add(self, collected: Collected) -> None:
+        self.env_steps += collected.env_steps
+        self.kept_steps += collected.kept_steps
+        self.episodes += len(collected.episodes)
+        returns = [episode.return_ for episode in collected.episodes]
+        reported = [episode.return_ for episode in collected.episodes if episode.kept]
+        self.recent_returns = (self.recent_returns + returns)[-WINDOW:]
+        self.reported_returns = (self.reported_returns + reported)[-WINDOW:]
+
+
+def named_params(policy: Policy, params: jax.Array) -> dict[str, np.ndarray]:
+    """The flat parameters as arrays named by their place in the network."""
+    leaves = jax.tree_util.tree_leaves_with_path(policy.unravel(params))
+    return {
+        "/".join(str(key.key) for key in path if key.key != "params"): np.asarray(leaf)
+        for path, leaf in leaves
+    }
+
+
+def flat_params(policy: Policy, example: jax.Array, named: Mapping[str, np.ndarray]) -> jax.Array:
+    """The inverse of `named_params`; `example` is any parameter vector of the policy."""
+    tree = policy.unravel(example)
+    structure = jax.tree_util.tree_structure(tree)
+    leaves = [jnp.asarray(named[name]) for name in named_params(policy, example)]
+    return ravel_pytree(jax.tree_util.tree_unflatten(structure, leaves))[0]
+
+
+def pack_member(
+    name: str,
+    p: int,
+    state: TrainState,
+    counters: Counters,
+    policy: Policy,
+    collector: HostCollector,
+    envs: HostEnvs,
+) -> dict[str, np.ndarray]:
+    """Member `p`'s state, every name starting with the member's."""
+    arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
+    arrays["adam/count"] = np.asarray(state.optimizer.count)
+    arrays["adam/mean"] = np.asarray(state.optimizer.mu)
+    arrays["adam/variance"] = np.asarray(state.optimizer.nu)
+    for key, value in dataclasses.asdict(counters).items():
+        dtype = np.float64 if isinstance(value, list) else np.int64
+        arrays[f"counters/{key}"] = np.asarray(value, dtype)
+    collect = collector.state
+    for moments in ("observation_moments", "reward_moments"):
+        for part, value in getattr(collect, moments)._asdict().items():
+            arrays[f"{moments}/{part}"] = value[p]
+    for key in ("observation", "discounted_return", "episode_return", "episode_length"):
+        arrays[f"collect/{key}"] = getattr(collect, key)[p]
+    number = collect.episode_length.shape[1]
+    for n in range(number):
+        for key, value in envs.snapshot(p * number + n).items():
+            arrays[f"envs/{n}/{key}"] = value
+    return {f"{name}/{key}": np.array(value) for key, value in arrays.items()}
+
+
+def unpack_member(
+    name: str,
+    p: int,
+    arrays: Mapping[str, np.ndarray],
+    example: TrainState,
+    policy: Policy,
+    collector: HostCollector,
+    envs: HostEnvs,
+    replay: bool,
+) -> tuple[TrainState, Counters]:
+    """Puts member `p` of the collector and its environments back; its learning state.
+
+    Without `replay` the environments stay at the start of an episode of their own.
+
+    Raises:
+      NotRestored: a replayed environment shows another observation than the stored one.
+    """
+    own = {key[len(name) + 1 :]: value for key, value in arrays.items()
+           if key.startswith(name + "/")}  # fmt: skip
+    named = {key[len("params/") :]: value for key, value in own.items()
+             if key.startswith("params/")}  # fmt: skip
+    adam = optax.ScaleByAdamState(
+        jnp.asarray(own["adam/count"]),
+        jnp.asarray(own["adam/mean"]),
+        jnp.asarray(own["adam/variance"]),
+    )
+    state = TrainState(flat_params(policy, example.params, named), adam)
+    counters = Counters(
+        **{
+            part.name: own[f"counters/{part.name}"].tolist()
+            for part in dataclasses.fields(Counters)
+        }
+    )
+    collect = collector.state
+    for moments in ("observation_moments", "reward_moments"):
+        for part in Moments._fields:
+            getattr(getattr(collect, moments), part)[p] = own[f"{moments}/{part}"]
+    if replay:
+        for key in ("observation", "discounted_return", "episode_return", "episode_length"):
+            getattr(collect, key)[p] = own[f"collect/{key}"]
+        _replay(name, p, own, collector, envs)
+    return state, counters
+
+
+def _replay(
+    name: str, p: int, own: Mapping[str, np.ndarray], collector: HostCollector, envs: HostEnvs
+) -> None:
+    stored = collector.state.observation[p]
+    for n in range(len(stored)):
+        prefix = f"envs/{n}/"
+        snapshot = {key[len(prefix) :]: value for key, value in own.items()
+                    if key.startswith(prefix)}  # fmt: skip
+        seen = envs.restore(p * len(stored) + n, snapshot)
+        if not np.array_equal(seen, stored[n]):
+            raise NotRestored(
+                f"{name}: environment {n} is not deterministic: replaying its episode ended at "
+                f"another observation than the checkpoint's; resume with --inexact to start new "
+                f"episodes instead"
+            )

@@ -1,0 +1,1 @@
+"""Metrics: `metrics.jsonl` is the truth, everything else shows it."""

@@ -1,0 +1,179 @@
+"""Named settings: PPO presets, arms (which selection method), and how a run's config is resolved.
+
+A preset says how PPO trains; an arm says which transitions the update keeps. METHOD, in
+`docs/algorithm.md`, gives the origin of every number.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from sauna.config import FIELDS, Config, check_consistent, check_read, parse, to_json
+from sauna.errors import BadInput, nearest
+
+# Schulman et al. (2017) and OpenAI baselines' defaults for MuJoCo are `Config`'s own defaults.
+PRESETS: dict[str, dict[str, Any]] = {
+    "mujoco": {},
+    # The SAUNA authors' run script: more epochs and a constant learning rate.
+    "mujoco-release": {"epochs": 15, "learning_rate_schedule": "constant"},
+}
+
+PRESET_HELP = {
+    "mujoco": "PPO on MuJoCo as published (Schulman et al. 2017, OpenAI baselines)",
+    "mujoco-release": "the same as the SAUNA authors ran it: 15 epochs, constant learning rate",
+}
+
+ARMS: dict[str, dict[str, Any]] = {
+    "ppo": {"filter": "none", "vex_coef": 0.0},
+    "vex-head": {"filter": "none"},
+    "random-drop": {"filter": "random-drop"},
+    "sauna": {"filter": "sauna", "vex_target": "sample"},
+    "sauna-paper": {"filter": "sauna", "vex_target": "rollout"},
+    "sauna-reference": {
+        "filter": "sauna",
+        "vex_target": "minibatch",
+        "history": "kept",
+        "decision": "joint",
+        "gae_over": "kept",
+        "truncation": "terminate",
+        "budget": "kept",
+        # The released loop has no bound and can run for ever; this one is rarely reached.
+        "max_env_steps_factor": 16,
+    },
+}
+
+ARM_HELP = {
+    "ppo": "PPO alone: no Vex loss, nothing dropped",
+    "vex-head": "the Vex head is trained, nothing is dropped",
+    "random-drop": "as SAUNA, but drops at random at a given rate (a control)",
+    "sauna": "the corrected method: every state has its own Vex target",
+    "sauna-paper": "the method as the paper states it",
+    "sauna-reference": "the method as the authors' released code does it, quirks included",
+}
+
+# What makes an arm what its name says; the user's own values do not apply to these.
+FIXED: dict[str, tuple[str, ...]] = {
+    "ppo": ("filter", "vex_coef"),
+    "vex-head": ("filter",),
+    "random-drop": ("filter",),
+}
+
+# Rules of the experiment rather than of the filter: an unfiltered arm beside a filtered one takes
+# them over, so that only the filter differs.
+_SHARED_RULES = ("vex_target", "filter", "history", "decision", "dropped", "max_env_steps_factor",
+                 "gae_over", "truncation", "budget")  # fmt: skip
+
+
+class Member(NamedTuple):
+    """One seed of one arm: what a population is made of."""
+
+    name: str
+    arm: str
+    seed: int
+    config: Config
+
+
+def resolve(given: Mapping[str, Any]) -> Config:
+    """The config of a run: defaults < preset < arm < what the user gave.
+
+    With several arms, the program-shaping values are those of the arm that filters.
+
+    Raises:
+      BadInput: an unknown key, arm or preset (naming the nearest), or impossible values.
+    """
+    parsed = _parse_all(given)
+    arms = parsed.get("arm", FIELDS["arm"].default)
+    _check_arms(arms, parsed)
+    configs = [_arm_config(arm, parsed) for arm in arms]
+    check_read(configs, parsed)
+    shared = next((config for config in configs if config.filter != "none"), configs[0])
+    for arm, config in zip(arms, configs, strict=True):
+        _check_same_program(arm, config, shared)
+    check_consistent(shared)
+    return shared
+
+
+def members(config: Config, given: Mapping[str, Any]) -> list[Member]:
+    """All members of a run, arm by arm and seed by seed; each with its own arm's config."""
+    parsed = _parse_all(given)
+    return [
+        Member(f"{arm}/{seed}", arm, seed, _member_config(arm, parsed, config))
+        for arm in config.arm
+        for seed in config.seeds
+    ]
+
+
+def _parse_all(given: Mapping[str, Any]) -> dict[str, Any]:
+    for name in given:
+        if name not in FIELDS:
+            raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
+    return {name: parse(name, value) for name, value in given.items()}
+
+
+def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
+    if not arms or len(set(arms)) != len(arms):
+        raise BadInput("arm: give each arm once, and at least one")
+    for arm in arms:
+        if arm not in ARMS:
+            raise BadInput(f"unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
+    preset = parsed.get("preset", FIELDS["preset"].default)
+    if preset not in PRESETS:
+        known = ", ".join(PRESETS)
+        raise BadInput(f"unknown preset {preset!r} (known: {known}){nearest(preset, PRESETS)}")
+    for name in parsed:
+        if all(name in FIXED.get(arm, ()) for arm in arms):
+            raise BadInput(f"{name}: fixed by arm {', '.join(arms)}; `--arm sauna` lets you set it")
+
+
+def _arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
+    preset = parsed.get("preset", FIELDS["preset"].default)
+    own = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
+    return dataclasses.replace(Config(), **{**PRESETS[preset], **ARMS[arm], **own})
+
+
+def _member_config(arm: str, parsed: Mapping[str, Any], shared: Config) -> Config:
+    """An arm's own traced values on the shared program; filter off is threshold 0."""
+    own = _arm_config(arm, parsed)
+    off = own.filter == "none" and shared.filter != "none"
+    rules = {name: getattr(shared, name) for name in _SHARED_RULES}
+    return dataclasses.replace(own, **rules, **({"threshold": 0.0} if off else {}))
+
+
+def _check_same_program(arm: str, config: Config, shared: Config) -> None:
+    if config.filter == "none" and shared.filter in ("none", "sauna"):
+        return
+    for name, field in FIELDS.items():
+        if field.metadata["shapes_program"] and getattr(config, name) != getattr(shared, name):
+            raise BadInput(
+                f"arm: {arm} differs from the other arms in {name}, which shapes the compiled "
+                f"program; train it in a run of its own"
+            )
+
+
+def stored_config(stored: Mapping[str, Any]) -> Config:
+    """The config that `config.to_json` wrote.
+
+    Raises:
+      BadInput: a key is unknown or missing, or a value cannot be read.
+    """
+    missing = [name for name in FIELDS if name not in stored]
+    if missing:
+        raise BadInput(f"config: {missing[0]!r} is missing")
+    return Config(**_parse_all(stored))
+
+
+def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a user has to give to get the `stored` config again, knowing what was `given` then.
+
+    A value edited in the stored config, or whose default has changed since, is given explicitly.
+    The run directory is left out: a new run takes a new one.
+    """
+    resolved = to_json(resolve(given))
+    edited = {
+        name: value
+        for name, value in stored.items()
+        if name != "out" and (name not in resolved or resolved[name] != value)
+    }
+    return {**{name: value for name, value in given.items() if name != "out"}, **edited}

@@ -1,0 +1,172 @@
+"""The run directory: what is in it, who may write to it, and how its logs are cut back.
+
+    config.json     every resolved value, versions, git revision, machine
+    metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
+    timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
+    summary.json    how each member ended
+    checkpoints/    see checkpoint.py
+    figures/, videos/, tensorboard/
+"""
+
+from __future__ import annotations
+
+import datetime
+import fcntl
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import IO, Any
+
+from sauna.checkpoint import sync_folder, write_durably
+from sauna.errors import BadInput
+
+LOGS = ("metrics.jsonl", "timing.jsonl")
+_PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
+
+
+def default_path(env: str, arms: tuple[str, ...]) -> Path:
+    """`runs/ENV_ARMS_TIME`, a new name each second."""
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    name = f"{env}_{'+'.join(arms)}_{now}".replace("/", "-").replace(":", "-")
+    return Path("runs") / name
+
+
+def create(path: Path) -> None:
+    """Makes an empty run directory.
+
+    Raises:
+      BadInput: it holds something already, or cannot be made.
+    """
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        hint = f"; `sauna resume {path}` continues it" if (path / "config.json").exists() else ""
+        raise BadInput(f"out: {path} is not empty{hint}")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"out: cannot make {path}: {error.strerror}") from error
+
+
+def lock(path: Path) -> IO[str]:
+    """Holds the run directory for this process until the returned file is closed or we die.
+
+    Raises:
+      BadInput: another process holds it; its number is named.
+    """
+    file = (path / ".lock").open("a+")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or "unknown"
+        file.close()
+        raise BadInput(f"{path} is in use by process {holder}") from None
+    file.truncate(0)
+    file.write(str(os.getpid()))
+    file.flush()
+    return file
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Atomically: a reader sees the old file or the new one."""
+    temporary = path.with_name(f".{path.name}.writing")
+    write_durably(temporary, (json.dumps(value, indent=1) + "\n").encode())
+    temporary.replace(path)
+    sync_folder(path.parent)
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """`config.json` of a run.
+
+    Raises:
+      BadInput: there is no run, or its config cannot be read.
+    """
+    path = run / "config.json"
+    if not path.is_file():
+        raise BadInput(f"{run} is not a run directory (it has no config.json)")
+    return read_config_file(path)
+
+
+def read_config_file(path: Path) -> dict[str, Any]:
+    """A file as `config.json` is: `config` and `given`, or plain settings.
+
+    Raises:
+      BadInput: the file cannot be read as that.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BadInput(f"config: cannot read {path}: {error}") from error
+    if not isinstance(value, dict):
+        raise BadInput(f"config: {path} does not hold a JSON object")
+    return value
+
+
+def rows(run: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
+    """All rows of a log; an unfinished last line (of a run in progress) is left out."""
+    path = run / name
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines(True) if line.endswith("\n")]
+
+
+def is_complete(run: Path) -> bool:
+    """Whether the run was trained to its end."""
+    path = run / "summary.json"
+    return path.is_file() and bool(json.loads(path.read_text())["complete"])
+
+
+def log_sizes(run: Path) -> dict[str, int]:
+    return {name: (run / name).stat().st_size for name in LOGS if (run / name).exists()}
+
+
+def cut_logs(run: Path, sizes: dict[str, int]) -> None:
+    """Brings the logs back to a checkpoint: rows behind it will be written again.
+
+    Raises:
+      BadInput: a log is shorter than the checkpoint says; rows were lost.
+    """
+    for name in LOGS:
+        path, size = run / name, sizes.get(name, 0)
+        if (path.stat().st_size if path.exists() else 0) < size:
+            raise BadInput(f"{path} is shorter than when the checkpoint was saved; rows are lost")
+        if path.exists():
+            os.truncate(path, size)
+
+
+def versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def machine() -> dict[str, Any]:
+    model = platform.processor() or platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+                break
+    except OSError:
+        pass
+    return {"system": platform.platform(), "processor": model, "cores": os.cpu_count()}
+
+
+def git_revision() -> str | None:
+    """Of the working directory, with `+changes` where it is not clean; None outside of git."""
+    try:
+        revision = _git("rev-parse", "HEAD")
+        return revision + ("+changes" if _git("status", "--porcelain") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=True, timeout=5)
+    return done.stdout.strip()

@@ -1,0 +1,174 @@
+"""Filters: which transitions of a rollout the update keeps.
+
+A filter is a pair of pure functions. `init(num_envs, capacity)` gives the state at the start of a
+rollout in which each env acts at most `capacity` times. `keep(state, observation, vex, key,
+hypers)` is called once per env step, in time order:
+
+  observation  [N, ...]  what the policy saw
+  vex          [N]       the Vex head's prediction there
+  key                    a JAX key of this step alone
+  hypers                 traced hyperparameters, of which `threshold` and `drop_rate` are filters'
+
+and returns the new state and the mask `[N]` of the envs whose transition is kept. An env whose
+quota is already full still has a row; its decision is ignored. Deciding never changes how an env
+acts, so a filter may be run over a stretch of steps after they happened: the host does that, the
+device decides step by step, and both get the same mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sauna.config import Config, import_name
+from sauna.core.types import Array, Hypers
+
+EPSILON = 1e-8  # epsilon_0 of eq. 7
+
+
+class Filter(NamedTuple):
+    """`init(num_envs, capacity) -> state`, `keep(state, ...) -> (state, mask [N])`."""
+
+    init: Callable[[int, int], Any]
+    keep: Callable[[Any, Array, Array, Array, Hypers], tuple[Any, Array]]
+
+
+class History(NamedTuple):
+    """Earlier predictions in rising order, so that their median is a look-up."""
+
+    ordered: Array  # [..., capacity + 1], +inf behind the first `count`
+    count: Array  # [...] int32
+
+
+def empty_history(lead: tuple[int, ...], capacity: int) -> History:
+    return History(
+        jnp.full((*lead, capacity + 1), jnp.inf, jnp.float32), jnp.zeros(lead, jnp.int32)
+    )
+
+
+def median(history: History) -> Array:
+    """Median over the last axis; the mean of the middle two of an even number. 0 if empty."""
+    low = jnp.maximum(history.count - 1, 0) // 2
+    pair = jnp.stack([low, history.count // 2], -1)
+    middle = jnp.take_along_axis(history.ordered, pair, -1)
+    return jnp.where(history.count > 0, 0.5 * (middle[..., 0] + middle[..., 1]), 0.0)
+
+
+def insert(history: History, x: Array) -> History:
+    """`x` `[...]` put in its place: each slot becomes the middle of (left neighbour, x, itself)."""
+    widths = [(0, 0)] * x.ndim + [(1, 0)]
+    left = jnp.pad(history.ordered[..., :-1], widths, constant_values=-jnp.inf)
+    ordered = jnp.maximum(left, jnp.minimum(history.ordered, x[..., None]))
+    return History(ordered, history.count + 1)
+
+
+def informative(vex: Array, history: History, threshold: Array) -> Array:
+    """Eq. 7: `|x| / (|median| + eps) >= threshold`; true while there is no history.
+
+    Written as a negation so that a NaN prediction is kept, where the finite checks see it, and
+    threshold 0 keeps everything.
+    """
+    ratio = jnp.abs(vex) / (jnp.abs(median(history)) + EPSILON)
+    return (history.count == 0) | ~(ratio < threshold)
+
+
+def sauna_per_env(history: str) -> Filter:
+    """Eq. 7 for each env by itself. `history`: medians over `all` steps or the `kept` ones."""
+
+    def init(num_envs: int, capacity: int) -> History:
+        return empty_history((num_envs,), capacity)
+
+    def keep(
+        state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
+    ) -> tuple[History, Array]:
+        mask = informative(vex, state, hypers.threshold)
+        seen = insert(state, vex)
+        if history == "kept":
+            seen = History(
+                jnp.where(mask[:, None], seen.ordered, state.ordered),
+                jnp.where(mask, seen.count, state.count),
+            )
+        return seen, mask
+
+    return Filter(init, keep)
+
+
+def sauna_joint(history: str) -> Filter:
+    """Eq. 7 for a vector step as a whole, as the released code does.
+
+    `runner.py` of the authors' release compares |mean over envs| with the median of all envs'
+    predictions pooled, and keeps or drops the step of every env together.
+    """
+
+    def init(num_envs: int, capacity: int) -> History:
+        return empty_history((), capacity * num_envs)
+
+    def keep(
+        state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
+    ) -> tuple[History, Array]:
+        kept = informative(jnp.mean(vex), state, hypers.threshold)
+        seen = state
+        for n in range(vex.shape[0]):
+            seen = insert(seen, vex[n])
+        if history == "kept":
+            seen = jax.tree.map(lambda new, old: jnp.where(kept, new, old), seen, state)
+        return seen, jnp.broadcast_to(kept, vex.shape)
+
+    return Filter(init, keep)
+
+
+def random_drop() -> Filter:
+    """Drops each step with probability `drop_rate`, whatever the head says: a control."""
+
+    def keep(
+        state: tuple[()], observation: Array, vex: Array, key: Array, hypers: Hypers
+    ) -> tuple[tuple[()], Array]:
+        return state, jax.random.uniform(key, vex.shape) >= hypers.drop_rate
+
+    return Filter(lambda num_envs, capacity: (), keep)
+
+
+def make_filter(config: Config) -> Filter | None:
+    """The filter that `config` names, or None where every transition is kept."""
+    if config.filter == "none":
+        return None
+    if config.filter == "random-drop":
+        return random_drop()
+    if config.filter == "sauna":
+        return (sauna_joint if config.decision == "joint" else sauna_per_env)(config.history)
+    return import_name("filter", config.filter)
+
+
+def decide(
+    filter: Filter,
+    state: Any,
+    observation: Array,
+    vex: Array,
+    first: Array,
+    length: Array,
+    key: Array,
+    hypers: Hypers,
+) -> tuple[Any, Array]:
+    """Runs a filter over a stretch of consecutive env steps.
+
+    Args:
+      observation: `[L, N, ...]`; `vex`: `[L, N]`, of which the first `length` rows count.
+      first: index of the stretch's first step within the rollout.
+      key: the rollout's filter key; step t uses `fold_in(key, t)`.
+
+    Returns:
+      the filter's state after the stretch, and the mask `[L, N]` (False behind `length`).
+    """
+
+    def step(carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
+        t, state, mask = carry
+        step_key = jax.random.fold_in(key, first + t)
+        state, kept = filter.keep(state, observation[t], vex[t], step_key, hypers)
+        return t + 1, state, mask.at[t].set(kept)
+
+    start = (jnp.int32(0), state, jnp.zeros(vex.shape, bool))
+    _, state, mask = jax.lax.while_loop(lambda carry: carry[0] < length, step, start)
+    return state, mask

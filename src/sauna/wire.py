@@ -1,0 +1,130 @@
+"""Messages between this project's own processes: a JSON header and named arrays, no pickle.
+
+A message is one safetensors blob whose metadata carries the header. Workers are started as
+`python -m MODULE` with a pair of pipes, so a user's script needs no `__main__` guard and a thread
+or lock of the parent is never inherited.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
+
+import numpy as np
+from safetensors.numpy import load, save
+
+
+class Message(NamedTuple):
+    """`header["kind"]` says what it is."""
+
+    header: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+def send(
+    connection: Connection, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None
+) -> None:
+    contiguous = {name: np.ascontiguousarray(a) for name, a in (arrays or {}).items()}
+    connection.send_bytes(save(contiguous, {"header": json.dumps(header)}))
+
+
+def receive(connection: Connection) -> Message:
+    """The next message.
+
+    Raises:
+      EOFError: the other side is gone.
+    """
+    return decode(connection.recv_bytes())
+
+
+def decode(blob: bytes) -> Message:
+    size = int.from_bytes(blob[:8], "little")
+    metadata = json.loads(blob[8 : 8 + size])["__metadata__"]
+    return Message(json.loads(metadata["header"]), load(blob))
+
+
+class ThreadProcess:
+    """A thread with as much of a process's face as `Worker` needs."""
+
+    pid = os.getpid()
+
+    def __init__(self, thread: threading.Thread) -> None:
+        self._thread = thread
+
+    def wait(self, timeout: float | None = None) -> int:
+        self._thread.join(timeout)
+        return 0
+
+    def kill(self) -> None:
+        """A thread cannot be killed; its closed inbox ends it at its next iteration."""
+
+
+class Worker(NamedTuple):
+    """A child process and the two ends of its pipes."""
+
+    process: subprocess.Popen[bytes] | ThreadProcess
+    inbox: Connection  # what the worker says
+    outbox: Connection  # what it is told
+
+    def say(self, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
+        send(self.outbox, header, arrays)
+
+    def stop(self, seconds: float = 5.0) -> None:
+        """Closes its inbox, which ends it; kills it where that is not enough."""
+        self.outbox.close()
+        try:
+            self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self.inbox.close()
+
+
+def start_worker(module: str, environment: dict[str, str]) -> Worker:
+    """Starts `python -m module READ_FD WRITE_FD` in its own process group (Ctrl-C is ours)."""
+    to_child_read, to_child_write = os.pipe()
+    to_parent_read, to_parent_write = os.pipe()
+    path = os.pathsep.join(part or os.getcwd() for part in sys.path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, str(to_child_read), str(to_parent_write)],
+        pass_fds=(to_child_read, to_parent_write),
+        env={**os.environ, "PYTHONPATH": path, **environment},
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    os.close(to_child_read)
+    os.close(to_parent_write)
+    return Worker(
+        process, Connection(to_parent_read, writable=False), Connection(to_child_write, readable=False)
+    )
+
+
+def start_thread(serve: Callable[[Connection, Connection], None]) -> Worker:
+    """The same in a thread of this process, for objects that another one could not import."""
+    to_thread_read, to_thread_write = os.pipe()
+    to_us_read, to_us_write = os.pipe()
+    inbox = Connection(to_thread_read, writable=False)
+    outbox = Connection(to_us_write, readable=False)
+
+    def target() -> None:
+        serve(inbox, outbox)
+        outbox.close()
+
+    thread = threading.Thread(target=target, daemon=True)
+    thread.start()
+    ends = Connection(to_us_read, writable=False), Connection(to_thread_write, readable=False)
+    return Worker(ThreadProcess(thread), *ends)
+
+
+def child_ends(arguments: list[str]) -> tuple[Connection, Connection]:
+    """In the child: `(inbox, outbox)` from its command line."""
+    return (
+        Connection(int(arguments[0]), writable=False),
+        Connection(int(arguments[1]), readable=False),
+    )

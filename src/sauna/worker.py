@@ -1,0 +1,151 @@
+"""A process (or thread) that trains some of a run's members and tells the coordinator of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import traceback
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from sauna.errors import SaunaError
+from sauna.wire import child_ends, receive, send
+
+
+class PipeReporter:
+    """Sends the loop's messages over a pipe; permissions come back over another.
+
+    The coordinator grants iterations, so that no process runs far ahead of the others and all can
+    stop at the same one. A coordinator that is gone ends the process.
+    """
+
+    def __init__(self, inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
+        self._inbox, self._outbox, self._dies_alone = inbox, outbox, dies_alone
+        self._granted = 0
+        self._stop = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        try:
+            while True:
+                header = receive(self._inbox).header
+                with self._changed:
+                    self._granted = header["granted"]
+                    self._stop = header["stop"]
+                    self._changed.notify()
+        except (EOFError, OSError):
+            if self._dies_alone:
+                os._exit(1)
+            with self._changed:
+                self._stop, self._granted = True, 0
+                self._changed.notify()
+
+    def phase(self, text: str) -> None:
+        send(self._outbox, {"kind": "phase", "text": text})
+
+    def may_start(self, iteration: int) -> bool:
+        with self._changed:
+            self._changed.wait_for(lambda: self._stop or iteration < self._granted)
+            return iteration < self._granted
+
+    def iteration(
+        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
+    ) -> None:
+        header = {"kind": "iteration", "iteration": iteration, "rows": rows, "timing": timing}
+        send(self._outbox, header)
+
+    def state(self, iteration: int, arrays: dict[str, np.ndarray]) -> None:
+        send(self._outbox, {"kind": "state", "iteration": iteration}, arrays)
+
+
+def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
+    """Receives a job, trains, and reports how it ended."""
+    try:
+        header, arrays = receive(inbox)
+        send(outbox, {"kind": "phase", "text": "importing JAX"})
+        configure_jax()
+        from sauna.train import train_members
+
+        reporter = PipeReporter(inbox, outbox, dies_alone)
+        train_members(read_job(header, arrays), reporter)
+        send(outbox, {"kind": "done"})
+    except (EOFError, BrokenPipeError):
+        return
+    except SaunaError as error:
+        send(outbox, {"kind": "failure", "message": str(error)})
+    except Exception:
+        send(outbox, {"kind": "failure", "message": traceback.format_exc()})
+
+
+def configure_jax() -> None:
+    """One CPU thread per process, synchronous dispatch, and a compilation cache on disk.
+
+    With one thread the bits of a result do not depend on the number of cores; the small programs
+    here run faster, too. A process that already used JAX keeps its own thread count.
+    """
+    os.environ.setdefault("PJRT_NPROC", "1")
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    import jax
+
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        jax.config.update("jax_compilation_cache_dir", os.path.join(base, "sauna", "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def write_job(
+    config: dict[str, Any],
+    given: Mapping[str, Any],
+    spaces: tuple[Any, ...],
+    members: list[int],
+    drop_rates: list[list[float]],
+    start: int,
+    replay: bool,
+) -> dict[str, Any]:
+    """The header of the message that starts a worker; the arrays beside it are a checkpoint's."""
+    return {
+        "config": config,
+        "given": dict(given),
+        "spaces": list(spaces),
+        "members": members,
+        "drop_rates": drop_rates,
+        "start": start,
+        "replay": replay,
+    }
+
+
+def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
+    """The `Job` of a `write_job` header."""
+    import json
+
+    from sauna.presets import members, stored_config
+    from sauna.spaces import Spaces
+    from sauna.train import Job
+
+    config = stored_config(header["config"])
+    everyone = members(config, header["given"])
+    return Job(
+        config=config,
+        spaces=Spaces(*(tuple(f) if isinstance(f, list) else f for f in header["spaces"])),
+        env_kwargs=json.loads(config.env_kwargs),
+        members=[everyone[index] for index in header["members"]],
+        drop_rates=header["drop_rates"],
+        restored=arrays or None,
+        start=header["start"],
+        replay=header["replay"],
+    )
+
+
+def main() -> None:
+    inbox, outbox = child_ends(sys.argv[1:])
+    serve(inbox, outbox, dies_alone=True)
+
+
+if __name__ == "__main__":
+    main()
