@@ -30,7 +30,7 @@ class Message(NamedTuple):
 def send(
     connection: Connection, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None
 ) -> None:
-    contiguous = {name: np.ascontiguousarray(a) for name, a in (arrays or {}).items()}
+    contiguous = {name: np.asarray(a, order="C") for name, a in (arrays or {}).items()}
     connection.send_bytes(save(contiguous, {"header": json.dumps(header)}))
 
 

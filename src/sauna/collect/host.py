@@ -152,7 +152,7 @@ class HostCollector:
                 if row % self._config.rollout_steps == 0:
                     noise = self._draw(iteration, row // self._config.rollout_steps)
                 assert noise is not None
-                self._step(params, noise[:, row % self._config.rollout_steps], row, acting, endings)
+                self._step(params, noise[row % self._config.rollout_steps], row, acting, endings)
             self._decide(filters, hypers, iteration, t, stretch, acting)
             kept += self._buffers.keep[:, t : t + stretch].sum(1)
             t += stretch
@@ -160,12 +160,13 @@ class HostCollector:
         return [self._collected(member, endings[member]) for member in range(len(self._keys))]
 
     def _draw(self, iteration: int, block: int) -> np.ndarray:
-        """Action noise of T steps `[P, T, N, M]`."""
+        """Action noise of T steps `[T, P, N, M]`."""
         return np.stack(
             [
                 np.asarray(self._program.draw(keys.action, np.int32(iteration), np.int32(block)))
                 for keys in self._keys
-            ]
+            ],
+            axis=1,
         )
 
     def _start_filters(self) -> list[Any]:

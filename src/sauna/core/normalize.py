@@ -39,18 +39,20 @@ def update_moments(moments: Moments, batch: Any, active: Any) -> Moments:
       active: `[..., N]` bool; other rows count for nothing. Where none is, nothing changes.
     """
     weight = active[..., None]
-    number = weight.sum(-2)
-    divisor = number + (number == 0)
-    batch_mean = (batch * weight).sum(-2) / divisor
-    deviation = (batch - batch_mean[..., None, :]) * weight
-    batch_variance = (deviation**2).sum(-2) / divisor
+    if batch.shape[-2] == 1:  # the mean is the sample and its variance 0: half of the work
+        number, batch_mean, batch_variance = weight[..., 0, :], batch[..., 0, :], 0.0
+    else:
+        number = weight.sum(-2)
+        divisor = number + (number == 0)
+        batch_mean = (batch * weight).sum(-2) / divisor
+        deviation = (batch - batch_mean[..., None, :]) * weight
+        batch_variance = (deviation**2).sum(-2) / divisor
     total = moments.count + number
-    delta = batch_mean - moments.mean
     fraction = number / total
+    delta = batch_mean - moments.mean
     mean = moments.mean + delta * fraction
-    variance = moments.variance * (moments.count / total) + batch_variance * fraction
-    variance = variance + delta**2 * (moments.count / total) * fraction
-    return Moments(mean, variance, total)
+    variance = (moments.variance + delta**2 * fraction) * (moments.count / total)
+    return Moments(mean, variance + batch_variance * fraction, total)
 
 
 def normalize(moments: Moments, batch: Any, clip: float) -> Any:

@@ -8,6 +8,7 @@ the snapshot. That is exact for every environment that is deterministic given th
 from __future__ import annotations
 
 import importlib
+import math
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -92,6 +93,7 @@ class GymnasiumEnvs(HostEnvs):
         dtype = np.uint8 if self.spaces.observation_kind == "image" else np.float64
         self._observation = np.zeros((number, *shape), dtype)
         self._final = np.zeros((number, *shape), dtype)
+        self._final_sum = 0.0
         self._reward = np.zeros(number)
         self._terminated = np.zeros(number, bool)
         self._truncated = np.zeros(number, bool)
@@ -132,13 +134,14 @@ class GymnasiumEnvs(HostEnvs):
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
             self._final[index] = self._read(observation)
+            self._final_sum = self._final.sum()
             self._start_episode(index, slot)
         else:
             self._observation[index] = self._read(observation)
 
     def _check_finite(self, active: np.ndarray) -> None:
         """One sum tells whether anything is amiss; only then the culprit is looked for."""
-        if np.isfinite(self._observation.sum() + self._final.sum() + self._reward.sum()):
+        if math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum):
             return
         for index in np.flatnonzero(active):
             slot = self._slots[index]
