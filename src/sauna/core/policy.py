@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from sauna.config import Config, import_name
@@ -65,6 +66,19 @@ def _named(module: Callable[..., nn.Module], name: str, **settings: Any) -> nn.M
     return module(name=name, **settings)
 
 
+def _unraveler(example: Params) -> Callable[[Array], Params]:
+    """The inverse of `ravel_pytree` for trees like `example`; it keeps the vector's precision."""
+    leaves, structure = jax.tree_util.tree_flatten(example)
+    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+
+    def unravel(vector: Array) -> Params:
+        parts = jnp.split(vector, ends)
+        shaped = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
+        return jax.tree_util.tree_unflatten(structure, shaped)
+
+    return unravel
+
+
 def make_policy(config: Config, spaces: Spaces) -> Policy:
     """The policy that `config` describes for environments with these `spaces`."""
     distribution = make_distribution(spaces)
@@ -75,9 +89,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         config.trunk == "shared",
     )
     example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
-    shapes = jax.eval_shape(network.init, jax.random.key(0), example)
-    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    unravel = ravel_pytree(zeros)[1]
+    unravel = _unraveler(jax.eval_shape(network.init, jax.random.key(0), example))
 
     def init(key: Array) -> Array:
         return ravel_pytree(network.init(key, example))[0]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,7 +49,20 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
             raise BadInput(f"env: cannot import {module!r}: {error}") from error
     if name not in gymnasium.registry:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
+    if "mujoco" in str(gymnasium.registry[name].entry_point):
+        _tame_mujoco()
     return lambda **more: gymnasium.make(name, disable_env_checker=True, **env_kwargs, **more)
+
+
+def _tame_mujoco() -> None:
+    """MuJoCo's warnings become Python's, instead of lines on stdout and a MUJOCO_LOG.TXT."""
+    import mujoco
+
+    def warn(message: str) -> None:
+        kind = DeprecationWarning if "deprecated" in message else RuntimeWarning
+        warnings.warn(f"MuJoCo: {message.strip()}", kind, stacklevel=2)
+
+    mujoco.set_mju_user_warning(warn)
 
 
 def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:

@@ -1,0 +1,100 @@
+"""Training in this process with the messages kept in memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+
+from sauna.config import Config
+from sauna.core.population import Program, make_program
+from sauna.envs.probe import probe
+from sauna.member_state import flat_params
+from sauna.presets import members, resolve
+from sauna.run import settle
+from sauna.train import Job, train_members
+
+SMALL = {
+    "rollout_steps": 32,
+    "minibatches": 4,
+    "epochs": 2,
+    "hidden": "8,8",
+    "steps": 128,
+    "seeds": 1,
+}
+
+
+class Recorder:
+    """A reporter that keeps everything and never refuses, or stops before iteration `stop`."""
+
+    def __init__(self, stop: int | None = None) -> None:
+        self.stop = stop
+        self.rows: list[dict[str, Any]] = []
+        self.states: dict[int, dict[str, np.ndarray]] = {}
+
+    def phase(self, text: str) -> None:
+        pass
+
+    def may_start(self, iteration: int) -> bool:
+        return self.stop is None or iteration < self.stop
+
+    def iteration(self, iteration: int, rows: list[dict], timing: dict) -> None:
+        self.rows += rows
+
+    def state(self, iteration: int, arrays: dict[str, np.ndarray]) -> None:
+        self.states[iteration] = arrays
+
+    @property
+    def final(self) -> dict[str, np.ndarray]:
+        return self.states[max(self.states)]
+
+
+def make_job(env: str, chosen: list[int] | None = None, **settings: Any) -> Job:
+    given = {"env": env, "processes": 1, **SMALL, **settings}
+    config = resolve(given)
+    found = probe(env, json.loads(config.env_kwargs))
+    config = settle(config, found.spaces)
+    everyone = members(config, given)
+    picked = everyone if chosen is None else [everyone[i] for i in chosen]
+    kwargs = json.loads(config.env_kwargs)
+    return Job(config, found.spaces, kwargs, picked, [], None, 0, found.differs is None)
+
+
+def train_here(job: Job, stop: int | None = None) -> Recorder:
+    recorder = Recorder(stop)
+    train_members(job, recorder)
+    return recorder
+
+
+def resumed(job: Job, recorder: Recorder) -> Job:
+    start = max(recorder.states)
+    return job._replace(restored=recorder.states[start], start=start)
+
+
+def policy_output(job: Job, arrays: dict[str, np.ndarray], member: str, observation: Any) -> Any:
+    """The trained network at normalised observations `[n, obs]`."""
+    import jax
+
+    program: Program = make_program(job.config, job.spaces)
+    example = program.init(jax.random.key(0)).params
+    prefix = f"{member}/params/"
+    named = {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
+    params = flat_params(program.policy, example, named)
+    return program.policy.apply(params, np.asarray(observation, np.float32))
+
+
+def configured(**settings: Any) -> Config:
+    """A config without looking at an environment."""
+    return dataclasses.replace(resolve({"env": "none", **settings}), network="mlp")
+
+
+def equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    return one.keys() == other.keys() and all(
+        one[k].dtype == other[k].dtype and one[k].tobytes() == other[k].tobytes() for k in one
+    )
+
+
+def own(arrays: dict[str, np.ndarray], member: str) -> dict[str, np.ndarray]:
+    return {k[len(member) :]: v for k, v in arrays.items() if k.startswith(member + "/")}

@@ -1,0 +1,250 @@
+"""Small environments with known answers. Importable by name, so that workers can make them."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+BOX = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+
+class World(gymnasium.Env):
+    """One observation, one reward, as the subclass says."""
+
+    observation_space: spaces.Space = BOX
+    action_space: spaces.Space = spaces.Discrete(2)
+    length = 1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        self.t = 0
+        self.seen = self.observe()
+        return self.seen, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        reward = self.reward(action)
+        self.t += 1
+        self.seen = self.observe()
+        return self.seen, reward, self.terminated(), self.truncated(), {}
+
+    def observe(self) -> np.ndarray:
+        return np.zeros(1)
+
+    def reward(self, action: Any) -> float:
+        return 1.0
+
+    def terminated(self) -> bool:
+        return self.t >= self.length
+
+    def truncated(self) -> bool:
+        return False
+
+
+class ConstantReward(World):
+    """V = 1 at its only state."""
+
+
+class ObservedReward(World):
+    """The reward is the observation, +1 or -1: V(o) = o."""
+
+    def observe(self) -> np.ndarray:
+        return np.array([self.np_random.choice([-1.0, 1.0])])
+
+    def reward(self, action: Any) -> float:
+        return float(self.seen[0])
+
+
+class TwoSteps(World):
+    """Reward 1 after the second step: V(0) = gamma, V(1) = 1."""
+
+    length = 2
+
+    def observe(self) -> np.ndarray:
+        return np.array([float(self.t)])
+
+    def reward(self, action: Any) -> float:
+        return float(self.t == 1)
+
+
+class GoodAction(World):
+    """Action 1 earns 1, action 0 earns -1."""
+
+    def reward(self, action: Any) -> float:
+        return 1.0 if int(action) == 1 else -1.0
+
+
+class MatchingAction(ObservedReward):
+    """The action has to match the sign of the observation."""
+
+    def reward(self, action: Any) -> float:
+        return 1.0 if (int(action) == 1) == (self.seen[0] > 0) else -1.0
+
+
+class Endless(World):
+    """Reward 1 for ever, cut off after 5 steps: V = 1 / (1 - gamma)."""
+
+    def terminated(self) -> bool:
+        return False
+
+    def truncated(self) -> bool:
+        return self.t >= 5
+
+
+class Finite(Endless):
+    """The same, but really over after 5 steps; the observation says how far it is."""
+
+    def observe(self) -> np.ndarray:
+        return np.array([float(self.t)])
+
+    def terminated(self) -> bool:
+        return self.t >= 5
+
+    def truncated(self) -> bool:
+        return False
+
+
+class Scripted(World):
+    """Continuous; observations wander with the seed, rewards tell steps apart, odd ends."""
+
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.counter = itertools.count(0 if seed is None else seed % 1000)
+        gymnasium.Env.reset(self, seed=seed)
+        self.end = int(self.np_random.integers(2, 12))
+        self.cut = bool(self.np_random.integers(2))
+        self.t = 0
+        return self.observe(), {}
+
+    def observe(self) -> np.ndarray:
+        return self.np_random.normal(size=3) * (1 + self.t)
+
+    def reward(self, action: Any) -> float:
+        return float(next(self.counter) % 17) + float(np.sum(action))
+
+    def terminated(self) -> bool:
+        return not self.cut and self.t >= self.end
+
+    def truncated(self) -> bool:
+        return self.cut and self.t >= self.end
+
+
+class Forgetful(Scripted):
+    """Not a function of its seed: cannot be restored by replaying."""
+
+    def observe(self) -> np.ndarray:
+        return np.random.default_rng().normal(size=3)
+
+
+class Lingering(Scripted):
+    """Repeats itself only until its first reset: state survives."""
+
+    played = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.played += 1
+        return super().reset(seed=seed)
+
+    def observe(self) -> np.ndarray:
+        return super().observe() + self.played
+
+
+class NotANumber(Scripted):
+    """A NaN in the second observation of the third episode."""
+
+    episodes = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.episodes += 1
+        return super().reset(seed=seed)
+
+    def observe(self) -> np.ndarray:
+        seen = super().observe()
+        if self.episodes == 3 and self.t == 1:
+            seen[1] = np.nan
+        return seen
+
+
+class Dying(Scripted):
+    """Its process ends in the middle of an episode."""
+
+    def reward(self, action: Any) -> float:
+        os._exit(7)
+
+
+class Hanging(Scripted):
+    """A step that never comes back."""
+
+    def reward(self, action: Any) -> float:
+        time.sleep(3600)
+        return 0.0
+
+
+class Raising(Scripted):
+    def reward(self, action: Any) -> float:
+        raise ValueError("the motor is on fire")
+
+
+class Picture(World):
+    """A 40 x 40 image whose brightness is the step; also renders it."""
+
+    observation_space = spaces.Box(0, 255, (2, 40, 40), np.uint8)
+    action_space = spaces.Discrete(3, start=5)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    length = 4
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+
+    def observe(self) -> np.ndarray:
+        image = np.full((2, 40, 40), self.t * 20, np.uint8)
+        image[1] += 1
+        return image
+
+    def reward(self, action: Any) -> float:
+        assert 5 <= action < 8
+        return float(action - 6)
+
+    def render(self) -> np.ndarray | None:
+        if self.render_mode is None:
+            return None
+        return np.repeat(self.observe()[0][..., None], 3, -1)
+
+
+class Spaced(World):
+    """Any spaces: observations are samples, actions must belong."""
+
+    length = 6
+
+    def __init__(self, observation: str = "box", action: str = "box") -> None:
+        self.observation_space = {
+            "box": spaces.Box(-1.0, 1.0, (2, 3), np.float32),
+            "discrete": spaces.Discrete(4, start=2),
+            "dict": spaces.Dict({"a": spaces.Box(0, 1, (2,)), "b": spaces.Discrete(3)}),
+            "text": spaces.Text(4),
+        }[observation]
+        self.action_space = {
+            "box": spaces.Box(-0.5, 0.5, (2, 2), np.float64),
+            "discrete": spaces.Discrete(3, start=-1),
+            "multi_discrete": spaces.MultiDiscrete([2, 3], start=[1, 4]),
+            "multi_binary": spaces.MultiBinary(4),
+            "tuple": spaces.Tuple([spaces.Discrete(2)]),
+        }[action]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.observation_space.seed(seed)
+        return super().reset(seed=seed)
+
+    def observe(self) -> Any:
+        return self.observation_space.sample()
+
+    def reward(self, action: Any) -> float:
+        assert self.action_space.contains(action), action
+        return 1.0
