@@ -14,7 +14,7 @@ from sauna.envs.probe import probe
 from sauna.member_state import flat_params
 from sauna.presets import members, resolve
 from sauna.run import settle
-from sauna.train import Job, train_members
+from sauna.training import Job, train_members
 
 SMALL = {
     "rollout_steps": 32,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sauna.api import Result, load, resume, train
     from sauna.errors import BadInput, SaunaError
-    from sauna.evaluate import evaluate
+    from sauna.evaluation import evaluate
     from sauna.selection.filters import Filter
     from sauna.selection.vex import VexTarget
 
@@ -23,7 +23,7 @@ _HOMES = {
     "load": "sauna.api",
     "resume": "sauna.api",
     "train": "sauna.api",
-    "evaluate": "sauna.evaluate",
+    "evaluate": "sauna.evaluation",
     "Filter": "sauna.selection.filters",
     "VexTarget": "sauna.selection.vex",
 }

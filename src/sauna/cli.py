@@ -166,13 +166,13 @@ def _eval(values: dict[str, Any]) -> None:
             raise BadInput(f"{name}: must be a whole number of at least {least}")
         values[name] = int(values[name])
     read_config(run)
-    from sauna.evaluate import choose_renderer
+    from sauna.evaluation import choose_renderer
     from sauna.worker import configure_jax
 
     if values["video"]:
         choose_renderer()
     configure_jax()
-    from sauna.evaluate import evaluate
+    from sauna.evaluation import evaluate
 
     result = evaluate(run, **values)
     print(f"{result['env']}, {result['mode']} actions, frozen normaliser, "

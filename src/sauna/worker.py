@@ -69,7 +69,7 @@ def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
         header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
         configure_jax()
-        from sauna.train import train_members
+        from sauna.training import train_members
 
         reporter = PipeReporter(inbox, outbox, dies_alone)
         train_members(read_job(header, arrays), reporter)
@@ -126,7 +126,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
 
     from sauna.presets import members, stored_config
     from sauna.spaces import Spaces
-    from sauna.train import Job
+    from sauna.training import Job
 
     config = stored_config(header["config"])
     everyone = members(config, header["given"])

@@ -113,7 +113,7 @@ def update(
         gradient, losses = jax.grad(loss, has_aux=True)(state.params, part)
         step, (_, adam) = transform.update(gradient, (optax.EmptyState(), state.optimizer))
         params = state.params - hypers.learning_rate * step
-        return TrainState(params, adam), (losses, optax.global_norm(gradient))
+        return TrainState(params, adam), (losses, jnp.linalg.norm(gradient))
 
     def epoch(
         state: TrainState, epoch_key: Array

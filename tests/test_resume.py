@@ -1,0 +1,179 @@
+"""A run interrupted anywhere and resumed ends with the bytes of a run left alone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import sauna
+from sauna import checkpoint, rundir
+from sauna.errors import BadInput, SaunaError
+
+from helpers import SMALL, equal, make_job, resumed, train_here
+
+WORLD = "worlds:Scripted"
+
+
+@pytest.mark.parametrize("stop", range(1, 8))
+@pytest.mark.parametrize(
+    "settings", [{"arm": "sauna", "threshold": 0.9, "seeds": 2}, {"arm": "ppo", "network": "mlp"}]
+)
+def test_interrupted_after_any_iteration(stop: int, settings) -> None:
+    job = make_job(WORLD, envs=2, steps=512, **settings)
+    whole = train_here(job)
+    first = train_here(job, stop)
+    second = train_here(resumed(job, first))
+    assert equal(second.final, whole.final)
+    assert first.rows + second.rows == whole.rows
+
+
+def command(run: Path, *more: str) -> list[str]:
+    flags = [f"--{k.replace('_', '-')}={v}" for k, v in SMALL.items() if k not in ("steps",)]
+    return [
+        sys.executable, "-m", "sauna", "train", WORLD, "--out", str(run), "--steps", "4000",
+        "--arm", "sauna", "--threshold", "0.9", "--processes", "2", "--checkpoint-every", "5",
+        *flags, "--seeds", "3", *more,
+    ]  # fmt: skip
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("whole") / "run"
+    subprocess.run(command(run), check=True, env=environment(), capture_output=True)
+    return run
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143),
+                                          (signal.SIGKILL, -9)])  # fmt: skip
+def test_a_signal_then_resume_gives_the_same_bytes(whole, tmp_path, number, code) -> None:
+    run = tmp_path / "run"
+    process = subprocess.Popen(
+        command(run), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while len(rundir.rows(run)) < 40 and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == code
+    assert len(rundir.rows(run)) < len(rundir.rows(whole))
+    if number != signal.SIGKILL:
+        assert f"continue with: sauna resume {run}" in errors
+        assert not rundir.is_complete(run)
+    sauna.resume(run, quiet=True, processes=1)
+    assert (run / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
+    states = [
+        (sorted((r / "checkpoints").iterdir())[-1] / "state.safetensors").read_bytes()
+        for r in (run, whole)
+    ]
+    assert states[0] == states[1]
+    assert rundir.is_complete(run)
+
+
+def test_resuming_a_complete_run_does_nothing(whole: Path, capsys) -> None:
+    before = {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.name != ".lock"}
+    sauna.resume(whole)
+    assert "nothing to do" in capsys.readouterr().out
+    assert before == {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.name != ".lock"}
+
+
+def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, capsys) -> None:
+    run = tmp_path / "run"
+    sauna.train("worlds:Forgetful", out=run, **SMALL)
+    said = capsys.readouterr().out
+    assert "does not repeat itself" in said and "not resumed exactly" in said
+    assert said.index("does not repeat") < said.index("writing to")
+    assert rundir.read_config(run)["exact_resume"] is False
+
+
+def test_a_run_of_such_an_environment_goes_on_with_new_episodes(tmp_path, capsys) -> None:
+    run = tmp_path / "run"
+    sauna.train("worlds:Forgetful", out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9,
+                arm="ppo", **SMALL)  # fmt: skip
+    make_incomplete(run, 2)
+    sauna.resume(run)
+    assert "every environment starts a new episode" in capsys.readouterr().out
+    assert [row["iteration"] for row in rundir.rows(run)] == [0, 1, 2, 3]
+
+
+def make_incomplete(run: Path, iteration: int) -> None:
+    """As if the run had been killed after checkpoint `iteration`."""
+    (run / "summary.json").unlink()
+    for path in checkpoint.numbered(run / "checkpoints"):
+        if int(path.name) > iteration:
+            for part in path.iterdir():
+                part.unlink()
+            path.rmdir()
+
+
+def finished(tmp_path: Path, **settings) -> Path:
+    run = tmp_path / "run"
+    sauna.train(WORLD, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9,
+                **{**SMALL, **settings})  # fmt: skip
+    return run
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys) -> None:
+    run = finished(tmp_path)
+    expected = (run / "metrics.jsonl").read_bytes()
+    (run / "summary.json").unlink()
+    newest = checkpoint.numbered(run / "checkpoints")[-1]
+    blob = bytearray((newest / "state.safetensors").read_bytes())
+    blob[len(blob) // 2] ^= 1
+    (newest / "state.safetensors").write_bytes(blob)
+    sauna.resume(run)
+    said = capsys.readouterr().out
+    assert newest.name in said and "SHA-256 differs" in said
+    assert newest.exists()
+    assert (run / "metrics.jsonl").read_bytes() == expected
+
+
+def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None:
+    import json
+
+    run = finished(tmp_path)
+    make_incomplete(run, 2)
+    path = run / "config.json"
+    stored = json.loads(path.read_text())
+    stored["config"]["gamma"] = 0.5
+    path.write_text(json.dumps(stored))
+    with pytest.raises(BadInput, match=r"gamma is 0.99, not 0.5"):
+        sauna.resume(run, quiet=True)
+    stored["config"]["gamma"] = 0.99
+    stored["config"]["env"] = "worlds:Endless"
+    path.write_text(json.dumps(stored))
+    with pytest.raises(BadInput, match="other spaces"):
+        sauna.resume(run, quiet=True)
+
+
+def test_two_processes_cannot_hold_one_run(tmp_path) -> None:
+    run = finished(tmp_path)
+    held = rundir.lock(run)
+    with pytest.raises(BadInput, match=f"in use by process {os.getpid()}"):
+        sauna.resume(run, quiet=True)
+    held.close()
+
+
+def test_lost_rows_are_noticed(tmp_path) -> None:
+    run = finished(tmp_path)
+    make_incomplete(run, 2)
+    os.truncate(run / "metrics.jsonl", 10)
+    with pytest.raises(BadInput, match="rows are lost"):
+        sauna.resume(run, quiet=True)
+
+
+def test_a_non_finite_update_stops_the_run_and_is_not_saved(tmp_path) -> None:
+    run = tmp_path / "run"
+    with pytest.raises(SaunaError, match="sauna/0: the update of iteration 0 is not finite"):
+        sauna.train(WORLD, out=run, quiet=True, **{**SMALL, "learning_rate": 1e38})
+    assert not checkpoint.numbered(run / "checkpoints")
+    assert rundir.rows(run) == []
