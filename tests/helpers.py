@@ -53,6 +53,8 @@ class Recorder:
 
 def make_job(env: str, chosen: list[int] | None = None, **settings: Any) -> Job:
     given = {"env": env, "processes": 1, **SMALL, **settings}
+    if "network" in settings:
+        del given["hidden"]  # which only the MLP reads
     config = resolve(given)
     found = probe(env, json.loads(config.env_kwargs))
     config = settle(config, found.spaces)

@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import configured
 from sauna.core.advantages import gae
 from sauna.core.batch import advantages_over_all, make_batch
 from sauna.core.types import Hypers, Rollout
 from sauna.selection.vex import TARGETS
-
-from helpers import configured
 
 
 def hypers(**values: float) -> Hypers:

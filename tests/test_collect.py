@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sauna.core.normalize import initial_moments, normalize, update_moments
-
 from helpers import make_job, train_here
+from sauna.core.normalize import initial_moments, normalize, update_moments
 from test_reference import RunningNormalizer
 
 

@@ -15,7 +15,6 @@ from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
 from sauna.errors import BadInput
 from sauna.spaces import action_writer, describe, observation_reader
-
 from worlds import Scripted, Spaced
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
@@ -203,7 +202,7 @@ def test_non_finite_numbers_are_refused_with_their_place(make: Make) -> None:
 def test_an_exception_names_the_environment(make: Make) -> None:
     envs = make("worlds:Raising", {})
     envs.reset()
-    with pytest.raises(EnvironmentFailure, match="environment 0 of seed 3.*on fire"):
+    with pytest.raises(EnvironmentFailure, match=r"environment 0 of seed 3.*on fire"):
         envs.step(actions(1)[0], np.ones(3, bool))
     envs.close()
 
@@ -220,7 +219,7 @@ def test_a_hung_worker_is_named_and_killed() -> None:
     envs = ProcessEnvs("worlds:Hanging", {}, SEEDS, processes=1, timeout=20.0)
     envs.reset()
     envs._timeout = 0.5
-    with pytest.raises(EnvironmentFailure, match="did not answer within 0.5 s"):
+    with pytest.raises(EnvironmentFailure, match=r"did not answer within 0\.5 s"):
         envs.step(actions(1)[0], np.ones(3, bool))
     assert envs._workers[0].process.wait() != 0
     envs.close()

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import configured
 from sauna.selection.filters import (
     Filter,
     decide,
@@ -22,8 +23,6 @@ from sauna.selection.filters import (
     sauna_joint,
     sauna_per_env,
 )
-
-from helpers import configured
 from test_losses import hypers
 
 
@@ -127,7 +126,14 @@ def test_deciding_in_stretches_is_deciding_step_by_step(name: str) -> None:
         padded = np.full((30, 2), 99.0, np.float32)
         padded[:length] = vex[t : t + length]
         state, mask = decide(
-            filter, state, jnp.zeros((30, 2, 4)), jnp.asarray(padded), t, length, jax.random.key(5), h
+            filter,
+            state,
+            jnp.zeros((30, 2, 4)),
+            jnp.asarray(padded),
+            t,
+            length,
+            jax.random.key(5),
+            h,
         )
         assert not np.asarray(mask)[length:].any()
         got.append(np.asarray(mask)[:length])

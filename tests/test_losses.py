@@ -8,14 +8,13 @@ import numpy as np
 import optax
 import pytest
 
+from helpers import configured
 from sauna.core.losses import combine, standardize, surrogate, value_error
 from sauna.core.policy import make_policy
 from sauna.core.types import Batch, Hypers
 from sauna.core.update import init_state, minibatch_losses, update
 from sauna.selection.vex import TARGETS
 from sauna.spaces import Spaces
-
-from helpers import configured
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 
@@ -131,9 +130,11 @@ def test_weight_0_samples_do_not_count_even_if_absurd() -> None:
 
     def gradient(part):
         return jax.grad(
-            lambda p: minibatch_losses(
-                p, part, hypers(), config=config, policy=policy, target=TARGETS["sample"]
-            ).total
+            lambda p: (
+                minibatch_losses(
+                    p, part, hypers(), config=config, policy=policy, target=TARGETS["sample"]
+                ).total
+            )
         )(params)
 
     np.testing.assert_array_equal(gradient(batch), gradient(absurd))
@@ -155,9 +156,7 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
         got, _, norm = update(state, batch, h, key, config=config, policy=policy, target=target)
 
         def loss(p, part):
-            return minibatch_losses(
-                p, part, h, config=config, policy=policy, target=target
-            ).total
+            return minibatch_losses(p, part, h, config=config, policy=policy, target=target).total
 
         params = np.asarray(state.params)
         mean, square, norms = np.zeros_like(params), np.zeros_like(params), []
@@ -173,9 +172,7 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
                 count += 1
                 mean = 0.9 * mean + 0.1 * g
                 square = 0.999 * square + 0.001 * g**2
-                step = (mean / (1 - 0.9**count)) / (
-                    np.sqrt(square / (1 - 0.999**count)) + 1e-5
-                )
+                step = (mean / (1 - 0.9**count)) / (np.sqrt(square / (1 - 0.999**count)) + 1e-5)
                 params = params - 0.02 * step
     np.testing.assert_allclose(got.params, params, atol=1e-9)
     np.testing.assert_allclose(norm, np.mean(norms), rtol=1e-9)

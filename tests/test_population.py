@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import sauna
+from helpers import SMALL, equal, make_job, own, train_here
 from sauna import checkpoint
 from sauna.errors import BadInput
 from sauna.presets import members, resolve
-
-from helpers import SMALL, equal, make_job, own, train_here
 
 WORLD = "worlds:Scripted"
 ARMS = [("ppo", {}), ("sauna", {"threshold": 0.9}), ("random-drop", {"drop_rate": 0.3}),

@@ -14,14 +14,13 @@ import jax
 import numpy as np
 import pytest
 
+from helpers import make_job
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
 from sauna.envs.contract import episode_seed
 from sauna.envs.gymnasium import GymnasiumEnvs
 from sauna.member_state import Counters
 from sauna.training import _hypers, _limit
-
-from helpers import make_job
 from worlds import Scripted
 
 T, N = 24, 2
@@ -163,9 +162,7 @@ class Setup:
 
     def collect(self, iteration: int):
         limit = np.array([_limit(self.config, Counters())])
-        collected = self.collector.collect(
-            self.params[None], [self.hypers], iteration, limit
-        )[0]
+        collected = self.collector.collect(self.params[None], [self.hypers], iteration, limit)[0]
         return collected, self.program.make_batch(collected.rollout, self.hypers)
 
     def act(self, seen, noise):

@@ -12,17 +12,16 @@ from pathlib import Path
 import pytest
 
 import sauna
+from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna import checkpoint, rundir
 from sauna.errors import BadInput, SaunaError
-
-from helpers import SMALL, equal, make_job, resumed, train_here
 
 WORLD = "worlds:Scripted"
 
 
 @pytest.mark.parametrize("stop", range(1, 8))
 @pytest.mark.parametrize(
-    "settings", [{"arm": "sauna", "threshold": 0.9, "seeds": 2}, {"arm": "ppo", "network": "mlp"}]
+    "settings", [{"arm": "sauna", "threshold": 0.9, "seeds": 2}, {"arm": "ppo"}]
 )
 def test_interrupted_after_any_iteration(stop: int, settings) -> None:
     job = make_job(WORLD, envs=2, steps=512, **settings)

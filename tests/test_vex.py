@@ -10,7 +10,6 @@ import pytest
 from sauna.core.batch import episode_numbers, kept_rows
 from sauna.core.update import head_statistics, variance_explained
 from sauna.selection.vex import TARGETS
-
 from test_advantages import random_rollout
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sauna import rundir, run as runs
+from sauna import run as runs
+from sauna import rundir
 from sauna.config import name_of
 from sauna.metrics.display import Display, PlainDisplay, make_display
 
@@ -66,7 +67,9 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
     return Result(run.path)
 
 
-def resume(path: str | Path, *, quiet: bool = False, inexact: bool = False, **changes: Any) -> Result:
+def resume(
+    path: str | Path, *, quiet: bool = False, inexact: bool = False, **changes: Any
+) -> Result:
     """Continues an interrupted run to its end; the result is that of a run left alone."""
     display: Display = _Silent() if quiet else make_display()
     run = runs.reopen(Path(path), changes, display)

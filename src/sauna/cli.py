@@ -38,8 +38,8 @@ def make_parser() -> argparse.ArgumentParser:
 
     resume = commands.add_parser("resume", help="continue a run", allow_abbrev=False)
     resume.add_argument("run", metavar="RUN", help="run directory")
-    resume.add_argument("--inexact", action="store_true",
-                        help="start new episodes where environments cannot be brought back")  # fmt: skip
+    text = "start new episodes where environments cannot be brought back"
+    resume.add_argument("--inexact", action="store_true", help=text)
     from sauna.run import RESUMABLE
 
     _add_fields(resume, list(RESUMABLE))
@@ -49,8 +49,8 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("run", metavar="RUN", help="run directory")
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
-    evaluate.add_argument("--deterministic", action="store_true",
-                          help="the most likely action (default: sampled, as in training)")  # fmt: skip
+    text = "the most likely action (default: sampled, as in training)"
+    evaluate.add_argument("--deterministic", action="store_true", help=text)
     evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
     evaluate.add_argument("--video", action="store_true", help="film the first episode")

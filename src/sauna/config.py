@@ -68,9 +68,7 @@ class Config:
     )
     steps: int = option(1_000_000, "env steps per member", at_least=1)
 
-    out: str = option(
-        "", "run directory (default: runs/ENV_ARM_TIME)", shapes_program=False
-    )
+    out: str = option("", "run directory (default: runs/ENV_ARM_TIME)", shapes_program=False)
     processes: int = option(
         0, "processes that share the members (0: one per core)", at_least=0, shapes_program=False
     )
@@ -154,7 +152,8 @@ class Config:
         "env", "decide for each env, or jointly for a vector step", choices=("env", "joint")
     )
     dropped: str = option(
-        "replace", "dropped steps: replaced by further env steps, or masked",
+        "replace",
+        "dropped steps: replaced by further env steps, or masked",
         choices=("replace", "mask"),
     )
     max_env_steps_factor: int = option(
@@ -164,17 +163,22 @@ class Config:
         "all", "advantages over all env steps, or over the kept ones", choices=("all", "kept")
     )
     truncation: str = option(
-        "bootstrap", "at a time limit: bootstrap the final value, or treat it as termination",
+        "bootstrap",
+        "at a time limit: bootstrap the final value, or treat it as termination",
         choices=("bootstrap", "terminate"),
     )
     budget: str = option("env", "what `steps` counts: all env steps or kept ones",
                          choices=("env", "kept"))  # fmt: skip
     drop_rate: float = option(
-        0.0, "share of steps that random-drop drops", at_least=0, at_most=0.99,
+        0.0,
+        "share of steps that random-drop drops",
+        at_least=0,
+        at_most=0.99,
         shapes_program=False,
     )
     drop_rate_from: str = option(
-        "", "a SAUNA run whose measured rates random-drop repeats, seed by seed",
+        "",
+        "a SAUNA run whose measured rates random-drop repeats, seed by seed",
         shapes_program=False,
     )
 
@@ -200,11 +204,11 @@ def parse(name: str, value: Any) -> Any:
     except (ValueError, TypeError, KeyError):
         expected = getattr(field_type, "__name__", str(field_type))
         raise BadInput(f"{name}: cannot read {value!r} as {expected}") from None
-    if isinstance(parsed, str) and meta["choices"] and parsed not in meta["choices"]:
-        if not (meta["plugin"] and ":" in parsed):
-            known = ", ".join(meta["choices"]) + (", or module:name" if meta["plugin"] else "")
-            hint = nearest(parsed, meta["choices"])
-            raise BadInput(f"{name}: unknown value {parsed!r} (known: {known}){hint}")
+    named = meta["plugin"] and ":" in str(parsed)
+    if isinstance(parsed, str) and meta["choices"] and parsed not in meta["choices"] and not named:
+        known = ", ".join(meta["choices"]) + (", or module:name" if meta["plugin"] else "")
+        hint = nearest(parsed, meta["choices"])
+        raise BadInput(f"{name}: unknown value {parsed!r} (known: {known}){hint}")
     for number in parsed if isinstance(parsed, tuple) else (parsed,):
         _check_bounds(name, number, meta)
     return parsed
@@ -378,9 +382,9 @@ def name_of(thing: Any) -> str:
         return thing
     module = getattr(thing, "__module__", None)
     name = getattr(thing, "__qualname__", None)
-    if isinstance(module, str) and isinstance(name, str) and module != "__main__":
-        if getattr(sys.modules.get(module), name, None) is thing:
-            return f"{module}:{name}"
+    importable = isinstance(module, str) and isinstance(name, str) and module != "__main__"
+    if importable and getattr(sys.modules.get(str(module)), str(name), None) is thing:
+        return f"{module}:{name}"
     from sauna import local
 
     name = f"{name or type(thing).__name__}_{id(thing):x}".replace("<", "").replace(">", "")

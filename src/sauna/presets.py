@@ -138,7 +138,7 @@ def _member_config(arm: str, parsed: Mapping[str, Any], shared: Config) -> Confi
     own = _arm_config(arm, parsed)
     off = own.filter == "none" and shared.filter != "none"
     rules = {name: getattr(shared, name) for name in _SHARED_RULES}
-    return dataclasses.replace(own, **rules, **({"threshold": 0.0} if off else {}))
+    return dataclasses.replace(own, **rules, threshold=0.0 if off else own.threshold)
 
 
 def _check_same_program(arm: str, config: Config, shared: Config) -> None:

@@ -1,11 +1,11 @@
 """The run directory: what is in it, who may write to it, and how its logs are cut back.
 
-    config.json     every resolved value, versions, git revision, machine
-    metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
-    timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
-    summary.json    how each member ended
-    checkpoints/    see checkpoint.py
-    figures/, videos/, tensorboard/
+config.json     every resolved value, versions, git revision, machine
+metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
+timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
+summary.json    how each member ended
+checkpoints/    see checkpoint.py
+figures/, videos/, tensorboard/
 """
 
 from __future__ import annotations
@@ -168,5 +168,7 @@ def git_revision() -> str | None:
 
 
 def _git(*arguments: str) -> str:
-    done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=True, timeout=5)
+    done = subprocess.run(
+        ["git", *arguments], capture_output=True, text=True, check=True, timeout=5
+    )
     return done.stdout.strip()

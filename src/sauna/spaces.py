@@ -38,6 +38,12 @@ class Spaces(NamedTuple):
         return one_each if self.action_kind.endswith("discrete") else self.action_sizes[0]
 
 
+def read_spaces(values: list[Any]) -> Spaces:
+    """`Spaces` back from its JSON form, where tuples have become lists."""
+    fields: list[Any] = [tuple(v) if isinstance(v, list) else v for v in values]
+    return Spaces(*fields)
+
+
 def describe(observation_space: Any, action_space: Any) -> Spaces:
     """The `Spaces` of a Gymnasium environment.
 

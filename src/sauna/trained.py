@@ -19,7 +19,7 @@ from sauna.envs.gymnasium import make_env
 from sauna.errors import BadInput, nearest
 from sauna.member_state import flat_params
 from sauna.presets import stored_config
-from sauna.spaces import Spaces, action_writer, describe, observation_reader
+from sauna.spaces import Spaces, action_writer, describe, observation_reader, read_spaces
 
 
 class Artifact(NamedTuple):
@@ -42,7 +42,7 @@ def load_artifact(run: Path, warn: Any = print) -> Artifact:
     loaded = checkpoint.load_newest(run / "checkpoints", warn)
     if loaded is None:
         raise BadInput(f"{run} has no checkpoint yet")
-    spaces = Spaces(*(tuple(f) if isinstance(f, list) else f for f in loaded.manifest["spaces"]))
+    spaces = read_spaces(loaded.manifest["spaces"])
     config = stored_config(loaded.manifest["config"])
     return Artifact(config, spaces, loaded.manifest["members"], loaded)
 
@@ -84,9 +84,7 @@ class TrainedPolicy:
             return distribution.mode(parameters)
         return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
 
-    def __call__(
-        self, observation: Any, *, deterministic: bool = True, key: Any = None
-    ) -> Any:
+    def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
         """The action for one raw observation, clipped as the environment wants it.
 
         Sampled actions need a JAX `key`; the normaliser is never updated.

@@ -109,7 +109,9 @@ def train_members(job: Job, reporter: Reporter) -> None:
             reporter.iteration(iteration, rows, timing)
             iteration += 1
             if iteration % config.checkpoint_every == 0:
-                reporter.state(iteration, _pack(program, members, states, counters, collector, envs))
+                reporter.state(
+                    iteration, _pack(program, members, states, counters, collector, envs)
+                )
         reporter.state(iteration, _pack(program, members, states, counters, collector, envs))
     finally:
         envs.close()
@@ -197,5 +199,7 @@ def _pack(
     """The whole state of all members, as named arrays."""
     arrays: Arrays = {}
     for p, member in enumerate(members):
-        arrays |= pack_member(member.name, p, states[p], counters[p], program.policy, collector, envs)
+        arrays |= pack_member(
+            member.name, p, states[p], counters[p], program.policy, collector, envs
+        )
     return arrays

@@ -101,7 +101,9 @@ def start_worker(module: str, environment: dict[str, str]) -> Worker:
     os.close(to_child_read)
     os.close(to_parent_write)
     return Worker(
-        process, Connection(to_parent_read, writable=False), Connection(to_child_write, readable=False)
+        process,
+        Connection(to_parent_read, writable=False),
+        Connection(to_child_write, readable=False),
     )
 
 

@@ -125,14 +125,14 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
     import json
 
     from sauna.presets import members, stored_config
-    from sauna.spaces import Spaces
+    from sauna.spaces import read_spaces
     from sauna.training import Job
 
     config = stored_config(header["config"])
     everyone = members(config, header["given"])
     return Job(
         config=config,
-        spaces=Spaces(*(tuple(f) if isinstance(f, list) else f for f in header["spaces"])),
+        spaces=read_spaces(header["spaces"]),
         env_kwargs=json.loads(config.env_kwargs),
         members=[everyone[index] for index in header["members"]],
         drop_rates=header["drop_rates"],

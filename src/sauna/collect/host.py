@@ -70,9 +70,7 @@ class HostCollector:
       keys: of each member.
     """
 
-    def __init__(
-        self, program: Program, spaces: Spaces, envs: HostEnvs, keys: list[Keys]
-    ) -> None:
+    def __init__(self, program: Program, spaces: Spaces, envs: HostEnvs, keys: list[Keys]) -> None:
         self._program, self._config, self._spaces = program, program.config, spaces
         self._envs, self._keys = envs, keys
         self._shape = (len(keys), self._config.envs)
@@ -80,7 +78,7 @@ class HostCollector:
             self._config.normalize_observations and spaces.observation_kind == "vector"
         )
         self._capacity = capacity(self._config)
-        self._buffers = self._allocate()
+        self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
         self.state = self._initial_state()
 
     def _initial_state(self) -> CollectState:
@@ -96,18 +94,19 @@ class HostCollector:
             np.zeros(shape, np.int64),
         )
 
-    def _allocate(self) -> Rollout:
+    def _allocate(self) -> Any:
         members, number = self._shape
         lead = (members, self._capacity, number)
         spaces = self._spaces
-        return Rollout(
-            observation=np.zeros((*lead, *spaces.observation_shape), spaces.observation_dtype),
-            action=np.zeros((*lead, spaces.action_width), spaces.action_dtype),
-            **{name: np.zeros(lead, np.float32) for name in
-               ("log_prob", "reward", "value", "next_value", "vex")},
-            **{name: np.zeros(lead, bool) for name in
-               ("terminated", "truncated", "valid", "keep")},
-        )  # fmt: skip
+        arrays: dict[str, Any] = {
+            "observation": np.zeros((*lead, *spaces.observation_shape), spaces.observation_dtype),
+            "action": np.zeros((*lead, spaces.action_width), spaces.action_dtype),
+        }
+        for name in ("log_prob", "reward", "value", "next_value", "vex"):
+            arrays[name] = np.zeros(lead, np.float32)
+        for name in ("terminated", "truncated", "valid", "keep"):
+            arrays[name] = np.zeros(lead, bool)
+        return Rollout(**arrays)
 
     def start(self) -> None:
         """Resets every environment; the first observations enter the running moments."""
@@ -251,9 +250,7 @@ class HostCollector:
     def _see(self, acting: np.ndarray) -> None:
         """The observations just received enter the running moments."""
         if self._normalizes:
-            moments = update_moments(
-                self.state.observation_moments, self.state.observation, acting
-            )
+            moments = update_moments(self.state.observation_moments, self.state.observation, acting)
             self.state = self.state._replace(observation_moments=moments)
 
     def _scaled_reward(self, reward: np.ndarray, acting: np.ndarray) -> np.ndarray:
@@ -331,4 +328,3 @@ def capacity(config: Config) -> int:
     if config.filter == "none" or config.dropped == "mask":
         return config.rollout_steps
     return config.rollout_steps * config.max_env_steps_factor
-

@@ -1,4 +1,4 @@
-"""The policy of one member: its network and action distribution, as functions of flat parameters."""
+"""The policy of one member: network and action distribution, as functions of flat parameters."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         return ravel_pytree(network.init(key, example))[0]
 
     def apply(params: Array, observation: Array) -> PolicyOutput:
-        return network.apply(unravel(params), observation)  # type: ignore[return-value]
+        return network.apply(unravel(params), observation)
 
     return Policy(init, apply, unravel, distribution)
 

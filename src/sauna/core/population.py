@@ -31,7 +31,7 @@ class Program(NamedTuple):
     policy: Policy
     filter: Filter | None
     init: Callable[[Array], TrainState]
-    draw: Callable[[Array, Array, Array], Array]
+    draw: Callable[[Array, Any, Any], Array]
     act: Callable[[Array, Any, Any], Array]
     value: Callable[[Array, Any], Array]
     decide: Callable[..., tuple[Any, Array]]

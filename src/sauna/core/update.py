@@ -36,7 +36,7 @@ class UpdateMetrics(NamedTuple):
 def optimizer(config: Config, hypers: Hypers) -> optax.GradientTransformation:
     """Global-norm clipping, then Adam without its step size (which is traced)."""
     return optax.chain(
-        optax.clip_by_global_norm(hypers.max_grad_norm),  # type: ignore[arg-type]
+        optax.clip_by_global_norm(hypers.max_grad_norm),
         optax.scale_by_adam(eps=config.adam_epsilon),
     )
 
@@ -101,9 +101,7 @@ def update(
     """
 
     def loss(params: Array, part: Batch) -> tuple[Array, Losses]:
-        losses = minibatch_losses(
-            params, part, hypers, config=config, policy=policy, target=target
-        )
+        losses = minibatch_losses(params, part, hypers, config=config, policy=policy, target=target)
         return losses.total, losses
 
     transform = optimizer(config, hypers)
@@ -115,9 +113,7 @@ def update(
         params = state.params - hypers.learning_rate * step
         return TrainState(params, adam), (losses, jnp.linalg.norm(gradient))
 
-    def epoch(
-        state: TrainState, epoch_key: Array
-    ) -> tuple[TrainState, tuple[Losses, Array]]:
+    def epoch(state: TrainState, epoch_key: Array) -> tuple[TrainState, tuple[Losses, Array]]:
         order = jax.random.permutation(epoch_key, batch.weight.shape[0])
         return jax.lax.scan(minibatch, state, order.reshape((config.minibatches, -1)))
 

@@ -131,11 +131,9 @@ class GymnasiumEnvs(HostEnvs):
         self._terminated[:] = False
         self._truncated[:] = False
         for index in np.flatnonzero(active):
-            self._step_one(index, self._slots[index], action[index])
+            self._step_one(int(index), self._slots[index], action[index])
         self._check_finite(active)
-        return Step(
-            self._observation, self._reward, self._terminated, self._truncated, self._final
-        )
+        return Step(self._observation, self._reward, self._terminated, self._truncated, self._final)
 
     def _step_one(self, index: int, slot: _Slot, action: np.ndarray) -> None:
         slot.actions.append(action)

@@ -11,8 +11,8 @@ import numpy as np
 from sauna.envs.contract import HostEnvs, Snapshot, Step
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
 from sauna.errors import SaunaError
-from sauna.spaces import Spaces
-from sauna.wire import Message, Worker, child_ends, receive, send, start_worker
+from sauna.spaces import read_spaces
+from sauna.wire import Message, child_ends, receive, send, start_worker
 
 
 class ProcessEnvs(HostEnvs):
@@ -41,8 +41,7 @@ class ProcessEnvs(HostEnvs):
             chosen = [list(seeds[i]) for i in part]
             worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen})
         answers = [self._answer(number) for number in range(processes)]
-        fields = answers[0].header["spaces"]
-        self.spaces = Spaces(*(tuple(f) if isinstance(f, list) else f for f in fields))
+        self.spaces = read_spaces(answers[0].header["spaces"])
 
     def reset(self) -> np.ndarray:
         for worker in self._workers:

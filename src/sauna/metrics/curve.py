@@ -21,7 +21,9 @@ COLOURS = {
 GRID = 100  # points at which members' curves are compared
 
 
-def member_curves(rows: list[dict[str, Any]]) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+def member_curves(
+    rows: list[dict[str, Any]],
+) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """`arm -> member -> (env steps, mean return of the last 100 episodes)`."""
     points: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for row in rows:

@@ -39,8 +39,8 @@ class Filter(NamedTuple):
 class History(NamedTuple):
     """Earlier predictions in rising order, so that their median is a look-up."""
 
-    ordered: Array  # [..., capacity + 1], +inf behind the first `count`
-    count: Array  # [...] int32
+    ordered: Array  # [..., capacity + 1], +inf behind the first `number`
+    number: Array  # [...] int32
 
 
 def empty_history(lead: tuple[int, ...], capacity: int) -> History:
@@ -51,10 +51,10 @@ def empty_history(lead: tuple[int, ...], capacity: int) -> History:
 
 def median(history: History) -> Array:
     """Median over the last axis; the mean of the middle two of an even number. 0 if empty."""
-    low = jnp.maximum(history.count - 1, 0) // 2
-    pair = jnp.stack([low, history.count // 2], -1)
+    low = jnp.maximum(history.number - 1, 0) // 2
+    pair = jnp.stack([low, history.number // 2], -1)
     middle = jnp.take_along_axis(history.ordered, pair, -1)
-    return jnp.where(history.count > 0, 0.5 * (middle[..., 0] + middle[..., 1]), 0.0)
+    return jnp.where(history.number > 0, 0.5 * (middle[..., 0] + middle[..., 1]), 0.0)
 
 
 def insert(history: History, x: Array) -> History:
@@ -62,7 +62,7 @@ def insert(history: History, x: Array) -> History:
     widths = [(0, 0)] * x.ndim + [(1, 0)]
     left = jnp.pad(history.ordered[..., :-1], widths, constant_values=-jnp.inf)
     ordered = jnp.maximum(left, jnp.minimum(history.ordered, x[..., None]))
-    return History(ordered, history.count + 1)
+    return History(ordered, history.number + 1)
 
 
 def informative(vex: Array, history: History, threshold: Array) -> Array:
@@ -72,7 +72,7 @@ def informative(vex: Array, history: History, threshold: Array) -> Array:
     threshold 0 keeps everything.
     """
     ratio = jnp.abs(vex) / (jnp.abs(median(history)) + EPSILON)
-    return (history.count == 0) | ~(ratio < threshold)
+    return (history.number == 0) | ~(ratio < threshold)
 
 
 def sauna_per_env(history: str) -> Filter:
@@ -89,7 +89,7 @@ def sauna_per_env(history: str) -> Filter:
         if history == "kept":
             seen = History(
                 jnp.where(mask[:, None], seen.ordered, state.ordered),
-                jnp.where(mask, seen.count, state.count),
+                jnp.where(mask, seen.number, state.number),
             )
         return seen, mask
 

@@ -1,0 +1,275 @@
+"""The workers of a run: granting iterations, and writing what they send in a fixed order.
+
+Workers run freely, but at most `LEAD` iterations ahead of the slowest, so that all can be stopped
+at the same iteration. Rows go to `metrics.jsonl` iteration by iteration and member by member, and
+a checkpoint is saved once every member has sent its state: the files do not depend on how members
+are shared over processes.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sauna import checkpoint, rundir
+from sauna.config import to_json
+from sauna.errors import Interrupted, SaunaError
+from sauna.metrics.curve import draw_curve
+from sauna.metrics.display import Display
+from sauna.metrics.tensorboard import TensorBoard
+from sauna.wire import Message, Worker, receive, start_thread, start_worker
+from sauna.worker import serve, write_job
+
+if TYPE_CHECKING:
+    from sauna.run import Run
+
+LEAD = 2  # iterations that a process may be ahead of the slowest one
+
+
+class Coordinator:
+    """The workers of one run and what they have sent but is not yet written."""
+
+    def __init__(
+        self,
+        run: Run,
+        display: Display,
+        loaded: checkpoint.Checkpoint | None,
+        inexact: bool,
+    ) -> None:
+        self._run, self._display = run, display
+        self._iteration = loaded.manifest["iteration"] if loaded else 0
+        self._parts = np.array_split(np.arange(len(run.members)), run.config.processes)
+        self._rows: dict[int, dict[int, Message]] = {}
+        self._states: list[dict[int, dict[str, np.ndarray]]] = [{} for _ in self._parts]
+        self._reached = [self._iteration] * len(self._parts)
+        self._ended: list[int | None] = [None] * len(self._parts)
+        self._due: list[tuple[int, dict[str, int]]] = []  # checkpoints waiting for their states
+        self._granted = 0
+        self._signal: int | None = None
+        self._tensorboard = TensorBoard(run.path, run.config)
+        replay = not inexact and run.differs is None
+        if loaded and not replay:
+            display.say("warning: not an exact resume: every environment starts a new episode")
+        self._workers = [self._start(part, loaded, replay) for part in self._parts]
+
+    def _start(
+        self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
+    ) -> Worker:
+        run = self._run
+        if any(str(v).startswith("sauna.local:") for v in to_json(run.config).values()):
+            worker = start_thread(partial(serve, dies_alone=False))
+        else:
+            worker = start_worker("sauna.worker", {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1",
+                                                   "JAX_PLATFORMS": "cpu"})  # fmt: skip
+        names = [run.members[index].name for index in part]
+        arrays = {
+            key: value
+            for key, value in (loaded.arrays if loaded else {}).items()
+            if any(key.startswith(name + "/") for name in names)
+        }
+        header = write_job(
+            to_json(run.config),
+            run.given,
+            run.spaces,
+            [int(index) for index in part],
+            [run.drop_rates[index] for index in part] if run.drop_rates else [],
+            self._iteration,
+            replay,
+        )
+        worker.say(header, arrays)
+        return worker
+
+    def __enter__(self) -> Coordinator:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        for worker in self._workers:
+            worker.stop(0.0 if error[0] else 5.0)
+        self._tensorboard.close()
+        self._display.close()
+        self._run.held.close()
+
+    def run(self) -> None:
+        self._display.open(self._run.config, self._run.members, self._run.path)
+        with _signals(self._on_signal):
+            self._grant()
+            while any(end is None for end in self._ended):
+                self._pump()
+        self._save(self._last_iteration(), rundir.log_sizes(self._run.path))
+        complete = self._signal is None
+        self._write_summary(complete)
+        if not complete:
+            raise Interrupted(
+                self._signal or 0,
+                f"stopped by {signal.Signals(self._signal or 0).name} after iteration "
+                f"{self._last_iteration()}; continue with: sauna resume {self._run.path}",
+            )
+        draw_curve(self._run.path)
+
+    def _last_iteration(self) -> int:
+        return max(end for end in self._ended if end is not None)
+
+    def _on_signal(self, number: int) -> None:
+        if self._signal is not None:
+            raise Interrupted(
+                number, f"stopped at once; continue with: sauna resume {self._run.path}"
+            )
+        self._signal = number
+        self._display.say(f"{signal.Signals(number).name}: finishing the iteration, then saving "
+                          f"(again to stop at once)")  # fmt: skip
+        self._tell()
+
+    def _grant(self) -> None:
+        """Lets every worker run at most `LEAD` iterations ahead of the slowest."""
+        running = [r for r, end in zip(self._reached, self._ended, strict=True) if end is None]
+        if running and self._signal is None and min(running) + LEAD > self._granted:
+            self._granted = min(running) + LEAD
+            self._tell()
+
+    def _tell(self) -> None:
+        for worker, end in zip(self._workers, self._ended, strict=True):
+            if end is None:
+                try:
+                    worker.say({"granted": self._granted, "stop": self._signal is not None})
+                except BrokenPipeError:
+                    pass  # its end is noticed, and named, when its inbox is read
+
+    def _pump(self) -> None:
+        """Handles whatever has arrived within a moment, and shows it."""
+        inboxes = {
+            worker.inbox: number
+            for number, worker in enumerate(self._workers)
+            if self._ended[number] is None
+        }
+        for inbox in wait(list(inboxes), timeout=0.1):
+            number = inboxes[inbox]  # type: ignore[index]
+            try:
+                message = receive(inbox)  # type: ignore[arg-type]
+            except EOFError:
+                code = self._workers[number].process.wait()
+                pid = self._workers[number].process.pid
+                raise SaunaError(
+                    f"training process {number} ({pid}) ended with exit code {code}"
+                ) from None
+            self._handle(number, message)
+        self._display.refresh()
+
+    def _handle(self, number: int, message: Message) -> None:
+        header = message.header
+        match header["kind"]:
+            case "phase":
+                self._display.phase(number, header["text"])
+            case "iteration":
+                self._rows.setdefault(header["iteration"], {})[number] = message
+                self._reached[number] = header["iteration"] + 1
+                self._display.rows(header["rows"], header["timing"]["seconds"])
+                self._grant()
+                self._flush()
+            case "state":
+                self._states[number][header["iteration"]] = message.arrays
+                self._flush()
+            case "failure":
+                raise SaunaError(header["message"])
+            case "done":
+                self._ended[number] = self._reached[number]
+                self._grant()
+                self._flush()
+
+    def _flush(self) -> None:
+        """Writes the iterations that are complete, in order, and the checkpoints among them."""
+        while self._complete(self._iteration, self._rows.get(self._iteration, {})):
+            messages = self._rows.pop(self._iteration)
+            rows = [row for number in sorted(messages) for row in messages[number].header["rows"]]
+            self._write_rows(rows, [m.header["timing"] for m in messages.values()])
+            self._iteration += 1
+            if self._iteration % self._run.config.checkpoint_every == 0:
+                self._due.append((self._iteration, rundir.log_sizes(self._run.path)))
+        while self._due and self._all_states_of(self._due[0][0]):
+            self._save(*self._due.pop(0))
+
+    def _complete(self, iteration: int, messages: Mapping[int, Message]) -> bool:
+        """Whether every process that runs this iteration has reported it."""
+        return bool(messages) and all(
+            number in messages or (end is not None and end <= iteration)
+            for number, end in enumerate(self._ended)
+        )
+
+    def _all_states_of(self, iteration: int) -> bool:
+        return all(
+            iteration in states or end is not None
+            for states, end in zip(self._states, self._ended, strict=True)
+        )
+
+    def _save(self, iteration: int, logs: dict[str, int]) -> None:
+        """A checkpoint of all members at (the start of) an iteration, or at their end before it."""
+        arrays: dict[str, np.ndarray] = {}
+        for states in self._states:
+            arrays |= states[iteration if iteration in states else max(states)]
+            for old in [key for key in states if key < iteration and key != max(states)]:
+                del states[old]
+        checkpoint.save_checkpoint(
+            self._run.path / "checkpoints",
+            iteration,
+            arrays,
+            {**self._run.manifest(), "logs": logs},
+            self._run.config.keep_checkpoints,
+        )
+
+    def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, float]]) -> None:
+        seconds = max(timing["seconds"] for timing in timings)
+        steps = sum(timing["env_steps"] for timing in timings)
+        timing = {
+            "iteration": self._iteration,
+            "env_steps": steps,
+            "seconds": seconds,
+            "collect_seconds": max(timing["collect_seconds"] for timing in timings),
+            "steps_per_second": steps / seconds,
+        }
+        _append(self._run.path / "metrics.jsonl", rows)
+        _append(self._run.path / "timing.jsonl", [timing])
+        self._tensorboard.write(rows, timing)
+
+    def _write_summary(self, complete: bool) -> None:
+        last: dict[str, dict[str, Any]] = {}
+        for row in rundir.rows(self._run.path):
+            last[row["member"]] = row
+        kept = ("arm", "seed", "env_steps", "kept_steps", "episodes", "return_mean",
+                "return_mean_reported", "explained_variance")  # fmt: skip
+        summary = {
+            name: {key: row[key] for key in kept if key in row} for name, row in last.items()
+        }
+        text = "return_mean: mean training return (sampled actions) of the last 100 episodes"
+        rundir.write_json(
+            self._run.path / "summary.json",
+            {"complete": complete, "metric": text, "members": summary},
+        )
+        self._display.summary(summary)
+
+
+def _append(path: Path, rows: list[dict[str, Any]]) -> None:
+    with path.open("a") as file:
+        file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
+
+
+@contextmanager
+def _signals(handle: Callable[[int], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM go to `handle`; in another thread than the main one nothing changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda n, frame: handle(n)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)

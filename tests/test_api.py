@@ -1,0 +1,188 @@
+"""`sauna.train(...)` in Python, policies, videos, TensorBoard, plug-ins, the picture."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+
+import sauna
+from helpers import SMALL, own
+from sauna import rundir
+from sauna.errors import BadInput
+from sauna.metrics.curve import interval, member_curves
+from sauna.trained import TrainedPolicy, load_artifact
+from worlds import Finite, Scripted
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    run = tmp_path_factory.mktemp("api") / "run"
+    return sauna.train("worlds:Scripted", quiet=True, out=run, tensorboard=True,
+                       **{**SMALL, "seeds": 2})  # fmt: skip
+
+
+def test_rows_hold_every_metric(result) -> None:
+    expected = {
+        "member", "arm", "seed", "iteration", "env_steps", "kept_steps", "keep_rate", "episodes",
+        "episode_returns", "episode_lengths", "episode_truncated", "return_mean", "policy_loss",
+        "value_loss", "vex_loss", "entropy", "kl", "clip_fraction", "gradient_norm",
+        "explained_variance", "vex_target", "vex_mean", "vex_spread", "vex_median",
+        "learning_rate",
+    }  # fmt: skip
+    for row in result.metrics:
+        assert set(row) == expected
+        assert all(math.isfinite(v) for v in row.values() if isinstance(v, float))
+    timing = rundir.rows(result.path, "timing.jsonl")
+    assert [row["iteration"] for row in timing] == sorted({r["iteration"] for r in result.metrics})
+    total = sum(row["env_steps"] for row in timing)
+    assert total == sum(row["env_steps"] for row in result.summary.values())
+    assert all(row["steps_per_second"] > 0 for row in timing)
+
+
+def test_config_json_says_everything(result) -> None:
+    stored = rundir.read_config(result.path)
+    assert stored["config"]["network"] == "mlp"
+    assert {"jax", "gymnasium", "numpy", "sauna-rl"} <= set(stored["versions"])
+    assert stored["machine"]["cores"] and stored["exact_resume"] is True
+
+
+def test_the_policy_acts_as_in_training(result) -> None:
+    """Normalised by hand, with the stored parameters, in plain numpy."""
+    artifact = load_artifact(result.path)
+    policy, world = TrainedPolicy(artifact, 1), Scripted()
+    observation, _ = world.reset(seed=3)
+    arrays = own(artifact.checkpoint.arrays, "sauna/1")
+    arrays = {name.removeprefix("/"): value for name, value in arrays.items()}
+    mean, variance = arrays["observation_moments/mean"], arrays["observation_moments/variance"]
+    x = np.clip((observation - mean) / np.sqrt(variance + 1e-8), -10, 10)
+    for layer in ("policy_trunk/layer_0", "policy_trunk/layer_1"):
+        x = np.tanh(x @ arrays[f"params/{layer}/kernel"] + arrays[f"params/{layer}/bias"])
+    x = x @ arrays["params/policy_head/kernel"] + arrays["params/policy_head/bias"]
+    np.testing.assert_allclose(policy(observation), np.clip(x, -1, 1), atol=1e-5)
+    samples = [policy(observation, deterministic=False, key=jax.random.key(i)) for i in range(9)]
+    assert len({s.tobytes() for s in samples}) == 9
+    with pytest.raises(ValueError, match="needs key"):
+        policy(observation, deterministic=False)
+    assert result.policy(member="sauna/0")(observation).shape == (2,)
+    with pytest.raises(BadInput, match="not between 0 and 1"):
+        result.policy(member=2)
+
+
+def test_evaluation_does_not_change_the_run_and_repeats(result) -> None:
+    before = (
+        sorted((result.path / "checkpoints").iterdir())[-1] / "state.safetensors"
+    ).read_bytes()
+    one = sauna.evaluate(result.path, episodes=4, seed=5)
+    two = sauna.evaluate(result.path, episodes=4, seed=5)
+    assert one == two and one["mode"] == "sampled"
+    best = sauna.evaluate(result.path, episodes=4, seed=5, deterministic=True)
+    assert best["mode"] == "deterministic" and best["members"] != one["members"]
+    row = one["members"]["sauna/0"]
+    assert row["mean"] == pytest.approx(np.mean(row["returns"]))
+    after = (sorted((result.path / "checkpoints").iterdir())[-1] / "state.safetensors").read_bytes()
+    assert before == after
+
+
+def test_tensorboard_holds_the_same_numbers(result) -> None:
+    from tensorboardX.proto.event_pb2 import Event
+
+    found: dict[str, list[float]] = {}
+    for path in (result.path / "tensorboard" / "sauna" / "0").iterdir():
+        blob, at = path.read_bytes(), 0
+        while at < len(blob):
+            size = int.from_bytes(blob[at : at + 8], "little")
+            event = Event.FromString(blob[at + 12 : at + 12 + size])
+            for value in event.summary.value:
+                found.setdefault(value.tag, []).append(value.simple_value)
+            at += 12 + size + 4
+    rows = [row for row in result.metrics if row["member"] == "sauna/0"]
+    for name in ("keep_rate", "vex_mean", "entropy", "kept_steps", "learning_rate"):
+        np.testing.assert_allclose(found[name], [row[name] for row in rows], rtol=1e-6)
+
+
+def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
+    named = sauna.train(Scripted, quiet=True, out=tmp_path / "named", **SMALL)
+    assert rundir.read_config(named.path)["config"]["env"] == "worlds:Scripted"
+    local = sauna.train(lambda: Scripted(), quiet=True, out=tmp_path / "local", **SMALL)
+    assert local.metrics == named.metrics
+
+
+def test_videos_are_written_and_read_back(tmp_path) -> None:
+    import imageio.v3 as imageio
+
+    run = sauna.train("worlds:Picture", quiet=True, out=tmp_path / "run", arm="ppo",
+                      rollout_steps=8, minibatches=2, epochs=1, steps=8)  # fmt: skip
+    played = sauna.evaluate(run.path, episodes=1, video=True)
+    frames = imageio.imread(played["video"])
+    assert frames.shape[0] == 5 and frames.shape[3] == 3
+    brightness = frames.mean((1, 2, 3))
+    np.testing.assert_allclose(brightness, np.arange(5) * 20, atol=6)
+
+
+def test_no_video_is_said_plainly(result) -> None:
+    with pytest.raises(sauna.SaunaError, match=r"video: .*rendered here|env: .*cannot be made"):
+        sauna.evaluate(result.path, episodes=1, video=True)
+
+
+def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_path) -> None:
+    other = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run", env_processes=2,
+                        processes=1, **{**SMALL, "seeds": 2})  # fmt: skip
+    assert other.metrics == result.metrics
+
+
+def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
+    """The code block of docs/plugins.md, as it stands there, from the command line."""
+    text = (ROOT / "docs" / "plugins.md").read_text()
+    code = text.split("```python\n")[1].split("```")[0]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 12
+    (tmp_path / "my_filters.py").write_text(code)
+    command = next(line for line in text.splitlines() if line.startswith("sauna train"))
+    arguments = [*command.split()[1:], "--out", "run", "--steps", "4096", "--seeds", "2"]
+    done = subprocess.run([sys.executable, "-m", "sauna", *arguments], cwd=tmp_path,
+                          capture_output=True, text=True)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rates = [row["keep_rate"] for row in rundir.rows(tmp_path / "run")]
+    assert min(rates) > 0.2 and max(rates) < 0.95
+
+
+def test_curves_and_their_interval() -> None:
+    rows = [
+        {"arm": "ppo", "member": f"ppo/{s}", "env_steps": x, "return_mean": float(s + x)}
+        for s in (0, 2) for x in (1, 2)
+    ]  # fmt: skip
+    curves = member_curves([*rows, {"arm": "ppo", "member": "ppo/0", "env_steps": 3}])
+    np.testing.assert_array_equal(curves["ppo"]["ppo/2"][1], [3.0, 4.0])
+    low, high = interval(np.array([[1.0], [3.0]]))
+    half = 12.706204736 * math.sqrt(2) / math.sqrt(2)  # t(1) at 97.5%, std sqrt(2), 2 members
+    np.testing.assert_allclose([low[0], high[0]], [2 - half, 2 + half], rtol=1e-6)
+
+
+def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
+    from sauna.metrics import display
+
+    monkeypatch.setattr(display.sys.stdout, "isatty", lambda: True, raising=False)
+    shown = display.make_display()
+    assert isinstance(shown, display.LiveDisplay)
+    sauna_run = sauna.api.runs.start(
+        {"env": "worlds:Finite", "out": str(tmp_path / "run"), **SMALL}, shown
+    )
+    sauna.api.runs.train(sauna_run, shown, resume=False)
+    text = capsys.readouterr().out
+    for word in ("sauna/0", "env steps", "keep rate", "Vex mean", "Vex spread"):
+        assert word in text
+
+
+def test_unknown_settings_name_the_nearest() -> None:
+    with pytest.raises(BadInput, match="unknown key 'treshold'; did you mean 'threshold'"):
+        sauna.train(Finite, treshold=1)
+    assert json.dumps(sauna.__all__) and isinstance(Finite(), gymnasium.Env)

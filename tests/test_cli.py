@@ -1,0 +1,246 @@
+"""The command line as a user meets it: exit codes, one clear line, nothing created."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers import SMALL
+from sauna import cli, rundir
+from sauna.config import FIELDS, flag, parse, to_json
+from sauna.errors import BadInput
+from sauna.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
+
+WORLD = "worlds:Scripted"
+TESTS = str(Path(__file__).parent)
+
+
+def sauna(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "sauna", *arguments],
+        capture_output=True, text=True, cwd=cwd, env={**os.environ, "PYTHONPATH": TESTS},
+    )  # fmt: skip
+
+
+def small_flags(**changes: object) -> list[str]:
+    return [f"{flag(k)}={v}" for k, v in {**SMALL, **changes}.items()]
+
+
+BAD = [
+    (["train", "HalfCheeta-v5"], "did you mean 'HalfCheetah-v5'?"),
+    (["train", WORLD, "--arm", "suana"], "did you mean 'sauna'?"),
+    (["train", WORLD, "--preset", "mujco"], "did you mean 'mujoco'?"),
+    (["train", WORLD, "--treshold", "0.2"], "did you mean '--threshold'?"),
+    (["train", WORLD, "--threshold"], "expected one argument"),
+    (["train", WORLD, "--filter", "sanua"], "did you mean 'sauna'?"),
+    (["train", WORLD, "--filter", "nowhere:it"], "cannot import 'nowhere'"),
+    (["train", WORLD, "--minibatches", "33"], "33 does not divide rollout_steps x envs = 2048"),
+    (["train", WORLD, "--steps", "-5"], "steps: must be at least 1"),
+    (["train", WORLD, "--steps", "100"], "less than one rollout"),
+    (["train", WORLD, "--steps", "1.5"], "steps: cannot read '1.5' as int"),
+    (["train", WORLD, "--seeds", "0"], "seeds: empty"),
+    (["train", WORLD, "--seeds", "1,1"], "seed is given twice"),
+    (["train", WORLD, "--seeds=-1,2"], "seeds: must lie between"),
+    (["train", WORLD, "--gamma", "1.1"], "gamma: must be at most 1"),
+    (["train", WORLD, "--gamma", "nan"], "gamma: must be a finite number"),
+    (["train", WORLD, "--hidden", ""], "hidden: cannot read"),
+    (["train", WORLD, "--env-kwargs", "[1]"], "env_kwargs: cannot read"),
+    (["train", WORLD, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
+    (["train", WORLD, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
+    (["train", WORLD, "--arm", "random-drop"], "random-drop needs a rate"),
+    (["train", WORLD, "--arm", "random-drop", "--drop-rate-from", "no"], "not a run directory"),
+    (["train", WORLD, "--gae-over", "kept"], "kept needs truncation=terminate"),
+    (["train", WORLD, "--network", "nature-cnn"], "does not fit vector observations"),
+    (["train", WORLD, "--env-processes", "3"], "more worker processes than environments"),
+    (["train", "worlds:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
+    (["train", "worlds:Picture", "--hidden", "8"], "hidden: not read"),
+    (["train"], "no environment given"),
+    (["train", "--config", "none.json"], "cannot read none.json"),
+    (["resume", "nothere"], "nothere is not a run directory"),
+    (["resume", "nothere", "--gamma", "1"], "unknown argument '--gamma'"),
+    (["eval", "nothere"], "nothere is not a run directory"),
+    (["eval", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
+    (["list", "foo"], "invalid choice"),
+    (["trian", WORLD], "invalid choice: 'trian'"),
+]
+
+
+@pytest.mark.parametrize("arguments, expected", BAD, ids=[" ".join(b[0]) for b in BAD])
+def test_bad_input_is_one_line_exit_2_and_nothing_created(
+    arguments, expected, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit:
+        cli.main(arguments)
+    errors = capsys.readouterr().err
+    assert exit.value.code == 2
+    assert expected in errors and errors.startswith("sauna: ")
+    assert errors.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_is_found_without_importing_jax(tmp_path) -> None:
+    code = (
+        "import sys, sauna.cli\n"
+        "try: sauna.cli.main(['train', 'Hopper-v5', '--minibatches', '7'])\n"
+        "except SystemExit as e: print(e.code, 'jax' in sys.modules, 'flax' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
+                          cwd=tmp_path)  # fmt: skip
+    assert done.stdout.split() == ["2", "False", "False"]
+
+
+def test_train_resume_eval_and_list_together(tmp_path) -> None:
+    run = tmp_path / "run"
+    done = sauna("train", WORLD, "--out", str(run), *small_flags(seeds=2), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "compiling" in done.stdout and "sauna/1: return" in done.stdout
+    assert {p.name for p in run.iterdir()} == {
+        ".lock", "checkpoints", "config.json", "figures", "metrics.jsonl", "summary.json",
+        "timing.jsonl",
+    }  # fmt: skip
+    assert (run / "figures" / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
+    again = sauna("train", WORLD, "--out", str(run), cwd=tmp_path)
+    assert again.returncode == 2 and f"sauna resume {run}" in again.stderr
+    assert "nothing to do" in sauna("resume", str(run), cwd=tmp_path).stdout
+    for mode in ("sampled", "deterministic"):
+        more = ["--deterministic"] if mode == "deterministic" else []
+        done = sauna("eval", str(run), "--episodes", "3", *more, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert f"{mode} actions, frozen normaliser" in done.stdout
+        assert "sauna/1: return" in done.stdout and "length" in done.stdout
+        stored = json.loads((run / f"evaluation_{mode}.json").read_text())
+        assert stored["mode"] == mode and len(stored["members"]["sauna/0"]["returns"]) == 3
+    done = sauna("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
+    assert done.returncode == 2 and "did you mean 'sauna/" in done.stderr
+    done = sauna("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
+    assert done.returncode == 2 and "the run's observation space is" in done.stderr
+    for what, word in (("envs", "HalfCheetah-v5"), ("arms", "sauna-paper"),
+                       ("presets", "mujoco-release"), ("filters", "random-drop"),
+                       ("targets", "minibatch")):  # fmt: skip
+        assert word in sauna("list", what).stdout
+
+
+def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> None:
+    flags = small_flags(arm="sauna", threshold=0.7, seeds="4,9", envs=2)
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert sauna("train", WORLD, "--out", str(first), *flags).returncode == 0
+    done = sauna("train", "--config", str(first / "config.json"), "--out", str(second))
+    assert done.returncode == 0, done.stderr
+    assert (first / "metrics.jsonl").read_bytes() == (second / "metrics.jsonl").read_bytes()
+    other = tmp_path / "other"
+    config = str(first / "config.json")
+    assert sauna("train", "--config", config, "--out", str(other), "--seeds", "4,").returncode == 0
+    rows = rundir.rows(other)
+    assert rows == [row for row in rundir.rows(first) if row["seed"] == 4]
+
+
+def test_a_value_edited_in_config_json_counts(tmp_path) -> None:
+    given = {"env": WORLD, "arm": "sauna", "seeds": "2"}
+    stored = to_json(resolve(given))
+    stored["threshold"] = 0.9
+    assert resolve(given_by(stored, given)).threshold == 0.9
+    stored["treshold"] = 0.9
+    with pytest.raises(BadInput, match="did you mean 'threshold'"):
+        resolve(given_by(stored, given))
+
+
+def test_every_field_has_a_flag_and_a_help_line(capsys) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    text = capsys.readouterr().out
+    for name, field in FIELDS.items():
+        assert len(field.metadata["help"]) > 5
+        assert name == "env" or flag(name) in text
+
+
+def test_config_goes_through_json_unchanged() -> None:
+    config = resolve({"env": "x", "seeds": "3,4", "hidden": "5,6", "env_kwargs": '{"b": 1}'})
+    assert stored_config(json.loads(json.dumps(to_json(config)))) == config
+
+
+@pytest.mark.parametrize(
+    "name, text, value",
+    [
+        ("steps", "1e6", 1_000_000),
+        ("seeds", "3", (0, 1, 2)),
+        ("seeds", "100,101", (100, 101)),
+        ("seeds", "7,", (7,)),
+        ("seeds", [5, 6], (5, 6)),
+        ("hidden", "512,256,128", (512, 256, 128)),
+        ("clip_value", "no", False),
+        ("learning_rate", "3e-4", 3e-4),
+        ("arm", "ppo, sauna", ("ppo", "sauna")),
+    ],
+)
+def test_values_are_read(name, text, value) -> None:
+    assert parse(name, text) == value
+
+
+@pytest.mark.parametrize(
+    "name, text", [("steps", True), ("gamma", "x"), ("clip_value", "maybe"), ("seeds", "a,b")]
+)
+def test_values_that_cannot_be_read(name, text) -> None:
+    with pytest.raises(BadInput, match=f"{name}: cannot read"):
+        parse(name, text)
+
+
+def test_presets_are_the_published_numbers() -> None:
+    config = resolve({"env": "x", "arm": "ppo"})
+    published = {
+        "rollout_steps": 2048, "envs": 1, "minibatches": 32, "epochs": 10, "learning_rate": 3e-4,
+        "learning_rate_schedule": "linear", "clip_range": 0.2, "entropy_coef": 0.0,
+        "value_coef": 0.5, "gamma": 0.99, "gae_lambda": 0.95, "hidden": (64, 64),
+        "activation": "tanh", "trunk": "separate", "adam_epsilon": 1e-5, "max_grad_norm": 0.5,
+        "clip_observations": 10.0, "clip_rewards": 10.0, "log_std_init": 0.0, "clip_value": True,
+    }  # fmt: skip
+    assert {name: getattr(config, name) for name in published} == published
+    release = resolve({"env": "x", "arm": "ppo", "preset": "mujoco-release"})
+    changed = {n for n in FIELDS if getattr(release, n) != getattr(config, n)}
+    assert changed == {"preset", "epochs", "learning_rate_schedule"}
+    assert (release.epochs, release.learning_rate_schedule) == (15, "constant")
+    assert set(PRESETS) == {"mujoco", "mujoco-release"}
+
+
+def test_arms_are_the_options_table() -> None:
+    def options(arm: str) -> tuple:
+        given = {"env": "x", "arm": arm, **({"drop_rate": 0.1} if arm == "random-drop" else {})}
+        c = members(resolve(given), given)[0].config
+        return (c.filter, c.vex_coef, c.vex_target, c.history, c.decision, c.dropped, c.gae_over,
+                c.truncation, c.budget)  # fmt: skip
+
+    corrected = ("all", "env", "replace", "all", "bootstrap", "env")
+    assert options("ppo") == ("none", 0.0, "sample", *corrected)
+    assert options("vex-head") == ("none", 0.5, "sample", *corrected)
+    assert options("random-drop") == ("random-drop", 0.5, "sample", *corrected)
+    assert options("sauna") == ("sauna", 0.5, "sample", *corrected)
+    assert options("sauna-paper") == ("sauna", 0.5, "rollout", *corrected)
+    quirks = ("kept", "joint", "replace", "kept", "terminate", "kept")
+    assert options("sauna-reference") == ("sauna", 0.5, "minibatch", *quirks)
+    assert {resolve({"env": "x", "arm": a}).threshold for a in ARMS if "sauna" in a} == {0.3}
+
+
+def test_random_drop_repeats_the_rates_of_a_run(tmp_path) -> None:
+    source, control = tmp_path / "source", tmp_path / "control"
+    flags = small_flags(seeds=2, steps=3000)
+    threshold = ["--threshold", "0.9"]
+    assert sauna("train", WORLD, "--out", str(source), *flags, *threshold).returncode == 0
+    done = sauna("train", WORLD, "--out", str(control), *flags, "--arm", "random-drop",
+                 "--drop-rate-from", str(source))  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for seed in (0, 1):
+        rates = [
+            np.mean([row["keep_rate"] for row in rundir.rows(run) if row["seed"] == seed])
+            for run in (source, control)
+        ]
+        assert rates[0] < 0.9 and abs(rates[0] - rates[1]) < 0.05
+    done = sauna("train", WORLD, "--out", str(tmp_path / "x"), *small_flags(seeds="5,"), "--arm",
+                 "random-drop", "--drop-rate-from", str(source))  # fmt: skip
+    assert done.returncode == 2 and "has no rows of seed 5" in done.stderr
+    assert not (tmp_path / "x").exists()
