@@ -104,9 +104,9 @@ class Coordinator:
             self._grant()
             while any(end is None for end in self._ended):
                 self._pump()
-        self._save(self._last_iteration(), rundir.log_sizes(self._run.path))
-        complete = self._signal is None
-        self._write_summary(complete)
+            complete = self._signal is None
+            self._save(self._last_iteration(), rundir.log_sizes(self._run.path))
+            self._write_summary(complete)
         if not complete:
             raise Interrupted(
                 self._signal or 0,
@@ -171,7 +171,7 @@ class Coordinator:
             case "iteration":
                 self._rows.setdefault(header["iteration"], {})[number] = message
                 self._reached[number] = header["iteration"] + 1
-                self._display.rows(header["rows"], header["timing"]["seconds"])
+                self._display.rows(header["rows"])
                 self._grant()
                 self._flush()
             case "state":

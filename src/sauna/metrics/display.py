@@ -19,7 +19,7 @@ class Display(Protocol):
     def say(self, text: str) -> None: ...
     def open(self, config: Config, members: list[Member], path: Path) -> None: ...
     def phase(self, process: int, text: str) -> None: ...
-    def rows(self, rows: list[dict[str, Any]], seconds: float) -> None: ...
+    def rows(self, rows: list[dict[str, Any]]) -> None: ...
     def refresh(self) -> None: ...
     def summary(self, members: dict[str, dict[str, Any]]) -> None: ...
     def close(self) -> None: ...
@@ -102,7 +102,7 @@ class PlainDisplay:
             self._phases.add(text)
             self.say(text)
 
-    def rows(self, rows: list[dict[str, Any]], seconds: float) -> None:
+    def rows(self, rows: list[dict[str, Any]]) -> None:
         assert self._progress is not None
         self._progress.rows(rows)
 
@@ -154,7 +154,7 @@ class LiveDisplay:
         assert self._progress is not None
         self._progress.phases[process] = text
 
-    def rows(self, rows: list[dict[str, Any]], seconds: float) -> None:
+    def rows(self, rows: list[dict[str, Any]]) -> None:
         assert self._progress is not None
         self._progress.rows(rows)
 

@@ -1,0 +1,41 @@
+# make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
+# make test   install into .venv, run the tests
+# make lint   style, format and types
+# make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
+
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+
+.PHONY: setup demo test lint results clean
+
+.venv/bin/python:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/.run: .venv/bin/python pyproject.toml
+	$(BIN)/pip install --quiet -e .
+	@touch $@
+
+.venv/.dev: .venv/bin/python pyproject.toml
+	$(BIN)/pip install --quiet -e '.[dev]'
+	@touch $@ .venv/.run
+
+setup: .venv/.dev
+
+demo: .venv/.run
+	$(BIN)/sauna train InvertedPendulum-v5 --arm sauna --seeds 3 --steps 100000
+
+test: .venv/.dev
+	$(BIN)/python -m pytest -n 2
+
+lint: .venv/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+results: .venv/.dev
+	$(BIN)/python results/make.py --train
+
+clean:
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache
