@@ -16,9 +16,10 @@ import pytest
 import sauna
 from helpers import SMALL, own
 from sauna import rundir
+from sauna.artifact import load_artifact
 from sauna.errors import BadInput
 from sauna.metrics.curve import interval, member_curves
-from sauna.trained import TrainedPolicy, load_artifact
+from sauna.trained import TrainedPolicy
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
@@ -89,6 +90,10 @@ def test_evaluation_does_not_change_the_run_and_repeats(result) -> None:
     assert best["mode"] == "deterministic" and best["members"] != one["members"]
     row = one["members"]["sauna/0"]
     assert row["mean"] == pytest.approx(np.mean(row["returns"]))
+    only = sauna.evaluate(str(result.path), member=0, episodes=4, seed=5)
+    assert only["members"] == {"sauna/0": row}
+    with pytest.raises(BadInput, match="at least 1"):
+        sauna.evaluate(result.path, episodes=0)
     after = (sorted((result.path / "checkpoints").iterdir())[-1] / "state.safetensors").read_bytes()
     assert before == after
 
@@ -153,6 +158,27 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in rundir.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
+
+
+def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
+    text = (ROOT / "docs" / "plugins.md").read_text()
+    (tmp_path / "my_targets.py").write_text(text.split("```python\n")[2].split("```")[0])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run",
+                      vex_target="my_targets:sign", **SMALL)  # fmt: skip
+    assert all(0 <= row["vex_target"] <= 1 for row in run.metrics)
+
+
+def test_python_values_of_all_kinds_are_taken(tmp_path) -> None:
+    settings = {
+        **SMALL,
+        "seeds": range(3, 5),
+        "steps": np.int64(64),
+        "learning_rate": np.float32(1),
+    }
+    run = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run", arm=["ppo"],
+                      env_kwargs={}, **{**settings, "hidden": None})  # fmt: skip
+    assert set(run.summary) == {"ppo/3", "ppo/4"}
 
 
 def test_curves_and_their_interval() -> None:

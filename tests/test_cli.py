@@ -60,6 +60,13 @@ BAD = [
     (["train", WORLD, "--env-processes", "3"], "more worker processes than environments"),
     (["train", "worlds:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
     (["train", "worlds:Picture", "--hidden", "8"], "hidden: not read"),
+    (["train", WORLD, "--seeds", "123456"], "write 123456,"),
+    (["train", WORLD, "--filter", "worlds:Scripted"], "is not a sauna.Filter"),
+    (["train", WORLD, "--vex-target", "worlds:Scripted"], "is not a sauna.VexTarget"),
+    (["train", WORLD, "--network", "worlds:Scripted"], "is not a flax.linen module"),
+    (["train", "worlds:ConstantReward", "--log-std-init", "1"], "log_std_init: not read"),
+    (["train", "worlds:Picture", "--normalize-observations"], "have no running moments"),
+    (["train", "worlds:Broken", "--env-kwargs", '{"broken": "step"}'], "cannot be played"),
     (["train"], "no environment given"),
     (["train", "--config", "none.json"], "cannot read none.json"),
     (["resume", "nothere"], "nothere is not a run directory"),
@@ -227,19 +234,23 @@ def test_arms_are_the_options_table() -> None:
 
 
 def test_random_drop_repeats_the_rates_of_a_run(tmp_path) -> None:
+    """Of its filtered arm: the rows of the PPO members beside it do not count."""
     source, control = tmp_path / "source", tmp_path / "control"
     flags = small_flags(seeds=2, steps=3000)
-    threshold = ["--threshold", "0.9"]
+    threshold = ["--threshold", "0.9", "--arm", "ppo,sauna"]
     assert sauna("train", WORLD, "--out", str(source), *flags, *threshold).returncode == 0
     done = sauna("train", WORLD, "--out", str(control), *flags, "--arm", "random-drop",
                  "--drop-rate-from", str(source))  # fmt: skip
     assert done.returncode == 0, done.stderr
     for seed in (0, 1):
         rates = [
-            np.mean([row["keep_rate"] for row in rundir.rows(run) if row["seed"] == seed])
+            np.mean([row["keep_rate"] for row in rundir.rows(run)
+                     if row["seed"] == seed and row["arm"] != "ppo"])
             for run in (source, control)
-        ]
+        ]  # fmt: skip
         assert rates[0] < 0.9 and abs(rates[0] - rates[1]) < 0.05
+    stored = rundir.read_config(control)["drop_rates"]
+    assert len(stored) == 2 and all(0 < rate < 1 for rates in stored for rate in rates[1:])
     done = sauna("train", WORLD, "--out", str(tmp_path / "x"), *small_flags(seeds="5,"), "--arm",
                  "random-drop", "--drop-rate-from", str(source))  # fmt: skip
     assert done.returncode == 2 and "has no rows of seed 5" in done.stderr

@@ -215,6 +215,38 @@ def test_a_dead_worker_is_named_with_its_exit_code() -> None:
     envs.close()
 
 
+def test_a_worker_killed_between_steps_is_named() -> None:
+    envs = in_workers("worlds:Scripted", {})
+    envs.reset()
+    envs._workers[1].process.kill()  # type: ignore[attr-defined]
+    envs._workers[1].process.wait()  # type: ignore[attr-defined]
+    with pytest.raises(EnvironmentFailure, match=r"worker 1 \(process \d+\) ended .* code -9"):
+        envs.step(actions(1)[0], np.ones(3, bool))
+    envs.close()
+
+
+@backends
+def test_an_episode_can_be_skipped(make: Make) -> None:
+    """What an inexact resume does: the episode after the one of the snapshot."""
+    envs = make("worlds:Scripted", {})
+    envs.reset()
+    got = envs.start_after(1, {"episode": np.asarray(4), "actions": np.zeros((0, 2))})
+    expected, _ = Scripted().reset(seed=episode_seed(3, 1, 5))
+    np.testing.assert_array_equal(got, expected)
+    envs.close()
+
+
+def test_a_non_finite_first_observation_is_refused() -> None:
+    with pytest.raises(EnvironmentFailure, match="episode 0, step 0"):
+        in_process("worlds:NotANumber", {"first": 1, "step": 0}).reset()
+
+
+@pytest.mark.parametrize("kwargs", [{"broken": "reset"}, {"broken": "step"}])
+def test_an_environment_that_cannot_be_played_is_bad_input(kwargs: dict) -> None:
+    with pytest.raises(BadInput, match="worlds:Broken cannot be played: TypeError: two lines"):
+        probe("worlds:Broken", kwargs)
+
+
 def test_a_hung_worker_is_named_and_killed() -> None:
     envs = ProcessEnvs("worlds:Hanging", {}, SEEDS, processes=1, timeout=20.0)
     envs.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -9,12 +10,14 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sauna
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna import checkpoint, rundir
 from sauna.errors import BadInput, SaunaError
+from worlds import Scripted
 
 WORLD = "worlds:Scripted"
 
@@ -126,19 +129,48 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys)
     expected = (run / "metrics.jsonl").read_bytes()
     (run / "summary.json").unlink()
     newest = checkpoint.numbered(run / "checkpoints")[-1]
-    blob = bytearray((newest / "state.safetensors").read_bytes())
+    good = (newest / "state.safetensors").read_bytes()
+    blob = bytearray(good)
     blob[len(blob) // 2] ^= 1
     (newest / "state.safetensors").write_bytes(blob)
     sauna.resume(run)
     said = capsys.readouterr().out
     assert newest.name in said and "SHA-256 differs" in said
-    assert newest.exists()
+    kept = newest.with_name(newest.name + ".bad")
+    assert (kept / "state.safetensors").read_bytes() == bytes(blob)
+    assert (newest / "state.safetensors").read_bytes() == good
     assert (run / "metrics.jsonl").read_bytes() == expected
 
 
-def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None:
-    import json
+@pytest.mark.parametrize("key, value", [("iteration", 7), ("logs", {}), ("members", ["x"])])
+def test_a_changed_manifest_is_noticed(tmp_path, key, value) -> None:
+    path = checkpoint.save_checkpoint(
+        tmp_path / "c", 3, {"a": np.arange(4)}, {"logs": {"m": 1}, "members": []}, 2
+    )
+    assert checkpoint.load_checkpoint(path).arrays["a"].tolist() == [0, 1, 2, 3]
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest[key] = value
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(checkpoint.BadCheckpoint, match=r"manifest\.json is not what was written"):
+        checkpoint.load_checkpoint(path)
 
+
+def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) -> None:
+    run = tmp_path / "run"
+    sauna.train(lambda: Scripted(), out=run, checkpoint_every=2, keep_checkpoints=9, **SMALL)
+    assert "can be resumed only from Python" in capsys.readouterr().out
+    expected = (run / "metrics.jsonl").read_bytes()
+    make_incomplete(run, 2)
+    stored = rundir.read_config(run)["config"]["env"]
+    delattr(sauna.local, stored.partition(":")[2])
+    with pytest.raises(BadInput, match="env: was passed by value; pass it again"):
+        sauna.resume(run)
+    sauna.resume(run, env=lambda: Scripted())
+    assert (run / "metrics.jsonl").read_bytes() == expected
+    assert sauna.load(run)(np.zeros(3)).shape == (2,)
+
+
+def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None:
     run = finished(tmp_path)
     make_incomplete(run, 2)
     path = run / "config.json"

@@ -161,13 +161,16 @@ class NotANumber(Scripted):
 
     episodes = 0
 
+    def __init__(self, first: int = 3, step: int = 1) -> None:
+        self.first, self.bad_step = first, step
+
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
         self.episodes += 1
         return super().reset(seed=seed)
 
     def observe(self) -> np.ndarray:
         seen = super().observe()
-        if self.episodes == 3 and self.t == 1:
+        if self.episodes == self.first and self.t == self.bad_step:
             seen[1] = np.nan
         return seen
 
@@ -185,6 +188,21 @@ class Hanging(Scripted):
     def reward(self, action: Any) -> float:
         time.sleep(3600)
         return 0.0
+
+
+class Broken(Scripted):
+    """A beginner's environment."""
+
+    def __init__(self, broken: str) -> None:
+        self.broken = broken
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        if self.broken == "reset":
+            raise TypeError("two\nlines")
+        return super().reset(seed=seed)
+
+    def reward(self, action: Any) -> float:
+        raise TypeError("two\nlines")
 
 
 class Raising(Scripted):

@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from sauna import local, rundir
 from sauna import run as runs
-from sauna import rundir
 from sauna.config import name_of
+from sauna.errors import BadInput
 from sauna.metrics.display import Display, PlainDisplay, make_display
+
+PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
 
 
 class Result:
@@ -55,12 +58,9 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
     """
     given = {"env": name_of(env)}
     for name, value in settings.items():
-        plugin = name in ("network", "filter", "vex_target")
-        given[name] = name_of(value) if plugin else value
-    if isinstance(given.get("arm"), list | tuple):
-        given["arm"] = ",".join(given["arm"])
-    if "out" in given:
-        given["out"] = str(given["out"])
+        given[name] = name_of(value) if name in PARTS and value is not None else value
+    if settings.get("out") is not None:
+        given["out"] = str(settings["out"])
     display: Display = _Silent() if quiet else make_display()
     run = runs.start(given, display)
     runs.train(run, display, resume=False)
@@ -70,15 +70,49 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
 def resume(
     path: str | Path, *, quiet: bool = False, inexact: bool = False, **changes: Any
 ) -> Result:
-    """Continues an interrupted run to its end; the result is that of a run left alone."""
+    """Continues an interrupted run to its end; the result is that of a run left alone.
+
+    Args:
+      path: the run directory.
+      quiet: show nothing.
+      inexact: start new episodes where environments cannot be brought back.
+      **changes: settings that do not touch what is computed (`processes`, ...), and the parts
+        (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
+    """
     display: Display = _Silent() if quiet else make_display()
-    run = runs.reopen(Path(path), changes, display)
+    rest = _provide(Path(path), changes)
+    run = runs.reopen(Path(path), rest, display)
     runs.train(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
-def load(path: str | Path, member: int | str = 0) -> Any:
-    """The policy of a run's newest good checkpoint."""
-    from sauna.trained import TrainedPolicy, load_artifact
+def load(path: str | Path, member: int | str = 0, **parts: Any) -> Any:
+    """The policy of a run's newest good checkpoint, as `policy(observation) -> action`.
+
+    The action is the most likely one; `policy(observation, deterministic=False, key=...)` samples.
+    `parts` are those that were passed by value when the run started (`env`, `network`, ...).
+    """
+    _provide(Path(path), parts)
+    from sauna.artifact import load_artifact
+    from sauna.trained import TrainedPolicy
 
     return TrainedPolicy(load_artifact(Path(path)), member)
+
+
+def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Puts parts passed by value where the run's config looks for them; returns the rest.
+
+    Raises:
+      BadInput: a part is given that the run finds by name, or one is missing.
+    """
+    config = rundir.read_config(path).get("config", {})
+    for name in PARTS:
+        module, _, attribute = str(config.get(name)).partition(":")
+        if module == local.__name__:
+            if name in given:
+                setattr(local, attribute, given[name])
+            elif not hasattr(local, attribute):
+                raise BadInput(f"{name}: was passed by value; pass it again as {name}=...")
+        elif name in given:
+            raise BadInput(f"{name}: the run finds its own by name ({config.get(name)})")
+    return {name: value for name, value in given.items() if name not in PARTS}

@@ -38,8 +38,6 @@ def save_checkpoint(
 ) -> Path:
     """Writes `folder/ITERATION` atomically, then removes all but the newest `keep`."""
     final = folder / f"{iteration:08d}"
-    if final.exists():  # the same state, saved before the run was stopped here
-        return final
     blob = save(dict(sorted(arrays.items())))
     manifest = {
         "format": FORMAT,
@@ -48,9 +46,16 @@ def save_checkpoint(
         "bytes": len(blob),
         **manifest,
     }
+    manifest["manifest_sha256"] = _digest(manifest)
+    if final.exists():
+        if _holds(final, manifest["sha256"]):  # saved before the run was stopped here
+            return final
+        final.rename(_free_name(final))
+    for left in folder.glob(".writing-*"):
+        shutil.rmtree(left)
     temporary = folder / f".writing-{iteration:08d}"
-    shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
+    sync_folder(folder.parent)
     write_durably(temporary / "state.safetensors", blob)
     write_durably(temporary / "manifest.json", json.dumps(manifest, indent=1).encode())
     sync_folder(temporary)
@@ -59,6 +64,26 @@ def save_checkpoint(
     for old in numbered(folder)[:-keep]:
         shutil.rmtree(old)
     return final
+
+
+def _digest(manifest: dict[str, Any]) -> str:
+    """Of everything in a manifest but the digest itself."""
+    rest = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def _holds(path: Path, sha256: str) -> bool:
+    """Whether a checkpoint is good and has these arrays."""
+    try:
+        return bool(load_checkpoint(path).manifest["sha256"] == sha256)
+    except BadCheckpoint:
+        return False
+
+
+def _free_name(path: Path) -> Path:
+    """Where a bad checkpoint is kept: `NUMBER.bad`, `NUMBER.bad2`, ..."""
+    names = (path.with_name(f"{path.name}.bad{i or ''}") for i in [0, *range(2, 1000)])
+    return next(name for name in names if not name.exists())
 
 
 def write_durably(path: Path, data: bytes) -> None:
@@ -94,7 +119,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise BadCheckpoint(f"{path}: cannot be read: {error}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise BadCheckpoint(f"{path}: not a checkpoint of format {FORMAT}")
-    if hashlib.sha256(blob).hexdigest() != manifest.get("sha256"):
+    if _digest(manifest) != manifest.get("manifest_sha256"):
+        raise BadCheckpoint(f"{path}: manifest.json is not what was written (SHA-256 differs)")
+    if path.name != f"{manifest['iteration']:08d}":
+        raise BadCheckpoint(f"{path}: holds iteration {manifest['iteration']}")
+    if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
         raise BadCheckpoint(f"{path}: state.safetensors is not what was written (SHA-256 differs)")
     return Checkpoint(path, manifest, load(blob))
 

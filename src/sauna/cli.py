@@ -7,6 +7,7 @@ starts in milliseconds, and a mistake can be answered with one line.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import traceback
 from pathlib import Path
@@ -158,22 +159,17 @@ def _resume(values: dict[str, Any]) -> None:
 
 
 def _eval(values: dict[str, Any]) -> None:
-    from sauna.rundir import read_config
-
     run = Path(values.pop("run"))
     for name, least in (("episodes", 1), ("seed", 0)):
         if not values[name].isdigit() or int(values[name]) < least:
             raise BadInput(f"{name}: must be a whole number of at least {least}")
         values[name] = int(values[name])
-    read_config(run)
-    from sauna.evaluation import choose_renderer
-    from sauna.worker import configure_jax
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("PJRT_NPROC", "1")
+    from sauna.evaluation import choose_renderer, evaluate
 
     if values["video"]:
         choose_renderer()
-    configure_jax()
-    from sauna.evaluation import evaluate
-
     result = evaluate(run, **values)
     print(f"{result['env']}, {result['mode']} actions, frozen normaliser, "
           f"checkpoint of iteration {result['iteration']}")  # fmt: skip

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sauna.errors import BadInput, nearest
+from sauna.errors import BadInput, nearest, one_line
 
 FILTERS = ("none", "sauna", "random-drop")
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
@@ -251,12 +251,18 @@ def _integer(value: Any) -> int:
     return int(number)
 
 
+MOST_SEEDS = 10_000
+
+
 def _seeds(value: Any) -> tuple[int, ...]:
     """A count (`6`, `"6"`) means seeds 0 to 5; a sequence or `"100,101"` names the seeds."""
     if isinstance(value, str) and "," in value:
         value = [part for part in value.split(",") if part.strip()]
     if isinstance(value, str | int | float):
-        return tuple(range(_integer(value)))
+        number = _integer(value)
+        if number > MOST_SEEDS:
+            raise BadInput(f"seeds: {number} is too many; for the seed {number} write {number},")
+        return tuple(range(number))
     return tuple(_integer(seed) for seed in value)
 
 
@@ -345,6 +351,9 @@ def check_consistent(config: Config) -> None:
         raise BadInput("drop_rate: give either drop_rate or drop_rate_from, not both")
     if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):
         raise BadInput("drop_rate: random-drop needs a rate, or drop_rate_from=RUN")
+    if config.env_processes and config.env.startswith("sauna.local:"):
+        raise BadInput("env_processes: the environment cannot be imported by another process; "
+                       "put it at the top level of a module")  # fmt: skip
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
     for name in ("network", "vex_target", "filter"):
@@ -365,7 +374,7 @@ def import_name(key: str, path: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # a user's module may fail in any way; all are bad input
-        raise BadInput(f"{key}: cannot import {module_name!r}: {error}") from error
+        raise BadInput(f"{key}: cannot import {module_name!r}: {one_line(error)}") from error
     if not hasattr(module, attribute):
         hint = nearest(attribute, vars(module))
         raise BadInput(f"{key}: module {module_name!r} has no {attribute!r}{hint}")
@@ -387,8 +396,7 @@ def name_of(thing: Any) -> str:
         return f"{module}:{name}"
     from sauna import local
 
-    name = f"{name or type(thing).__name__}_{id(thing):x}".replace("<", "").replace(">", "")
-    name = name.replace(".", "_")
+    name = "".join(c if c.isalnum() else "_" for c in name or type(thing).__name__)
     setattr(local, name, thing)
     return f"{local.__name__}:{name}"
 

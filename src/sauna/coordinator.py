@@ -55,6 +55,7 @@ class Coordinator:
         self._due: list[tuple[int, dict[str, int]]] = []  # checkpoints waiting for their states
         self._granted = 0
         self._signal: int | None = None
+        self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
         replay = not inexact and run.differs is None
         if loaded and not replay:
@@ -85,7 +86,10 @@ class Coordinator:
             self._iteration,
             replay,
         )
-        worker.say(header, arrays)
+        try:
+            worker.say(header, arrays)
+        except BrokenPipeError:
+            pass  # its end is noticed, and named, when its inbox is read
         return worker
 
     def __enter__(self) -> Coordinator:
@@ -96,16 +100,17 @@ class Coordinator:
             worker.stop(0.0 if error[0] else 5.0)
         self._tensorboard.close()
         self._display.close()
-        self._run.held.close()
 
     def run(self) -> None:
-        self._display.open(self._run.config, self._run.members, self._run.path)
+        run = self._run
+        self._display.open(run.config, run.members, run.path, rundir.rows(run.path))
         with _signals(self._on_signal):
             self._grant()
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None
             self._save(self._last_iteration(), rundir.log_sizes(self._run.path))
+            draw_curve(self._run.path)
             self._write_summary(complete)
         if not complete:
             raise Interrupted(
@@ -113,25 +118,29 @@ class Coordinator:
                 f"stopped by {signal.Signals(self._signal or 0).name} after iteration "
                 f"{self._last_iteration()}; continue with: sauna resume {self._run.path}",
             )
-        draw_curve(self._run.path)
 
     def _last_iteration(self) -> int:
         return max(end for end in self._ended if end is not None)
 
     def _on_signal(self, number: int) -> None:
+        """Only notes the first signal: it may come in the middle of anything."""
         if self._signal is not None:
             raise Interrupted(
                 number, f"stopped at once; continue with: sauna resume {self._run.path}"
             )
         self._signal = number
-        self._display.say(f"{signal.Signals(number).name}: finishing the iteration, then saving "
-                          f"(again to stop at once)")  # fmt: skip
+
+    def _stop(self, number: int) -> None:
+        """Lets every worker end at the iteration that is granted, which is the same for all."""
+        self._stopping = True
+        name = signal.Signals(number).name
+        self._display.say(f"{name}: finishing the iteration, then saving (again to stop at once)")
         self._tell()
 
     def _grant(self) -> None:
         """Lets every worker run at most `LEAD` iterations ahead of the slowest."""
         running = [r for r, end in zip(self._reached, self._ended, strict=True) if end is None]
-        if running and self._signal is None and min(running) + LEAD > self._granted:
+        if running and not self._stopping and min(running) + LEAD > self._granted:
             self._granted = min(running) + LEAD
             self._tell()
 
@@ -139,12 +148,14 @@ class Coordinator:
         for worker, end in zip(self._workers, self._ended, strict=True):
             if end is None:
                 try:
-                    worker.say({"granted": self._granted, "stop": self._signal is not None})
+                    worker.say({"granted": self._granted, "stop": self._stopping})
                 except BrokenPipeError:
                     pass  # its end is noticed, and named, when its inbox is read
 
     def _pump(self) -> None:
         """Handles whatever has arrived within a moment, and shows it."""
+        if self._signal is not None and not self._stopping:
+            self._stop(self._signal)
         inboxes = {
             worker.inbox: number
             for number, worker in enumerate(self._workers)

@@ -26,3 +26,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """`; did you mean X?` for the known word closest to `word`, or an empty string."""
     found = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f"; did you mean {found[0]!r}?" if found else ""
+
+
+def one_line(error: BaseException) -> str:
+    """Type and message of somebody else's exception, in one line of bounded length."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]

@@ -7,21 +7,23 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from sauna import rundir
+from sauna.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.envs.gymnasium import make_env
-from sauna.errors import SaunaError
-from sauna.trained import Artifact, TrainedPolicy, find_member, load_artifact
+from sauna.errors import BadInput, SaunaError
+
+if TYPE_CHECKING:
+    from sauna.trained import TrainedPolicy
 
 
 def evaluate(
-    run: Path,
+    run: str | Path,
     *,
-    member: str | None = None,
+    member: str | int | None = None,
     episodes: int = 10,
     deterministic: bool = False,
     seed: int = 0,
@@ -29,24 +31,32 @@ def evaluate(
     video: bool = False,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
-    """Plays `episodes` episodes with each member and writes `evaluation_MODE.json`.
+    """Plays `episodes` episodes with each member.
+
+    All members on the run's own environment are written to `evaluation_MODE.json`; a part of them,
+    or another environment, is only returned.
 
     Args:
+      run: the run directory.
       member: only this one; default all.
       deterministic: the distribution's mode; otherwise actions are sampled.
       seed: episodes are reset with seeds `seed`, `seed + 1`, ...
       env: another environment with the same spaces; default the run's.
       video: also films the first member's first episode.
+      say: is told of checkpoints that cannot be trusted.
 
     Returns:
       `{"mode", "env", "seed", "members": {name: {"returns", "lengths", "mean", ...}}}`.
 
     Raises:
-      BadInput: no such run or member, or `env` has other spaces.
+      BadInput: no such run or member, impossible numbers, or `env` has other spaces.
       SaunaError: a video was asked for and the environment cannot render here.
     """
+    run = Path(run)
+    if episodes < 1 or seed < 0:
+        raise BadInput("episodes: must be at least 1, and seed at least 0")
     artifact = load_artifact(run, say)
-    names = [find_member(artifact.members, member)] if member else artifact.members
+    chosen = artifact.members if member is None else [find_member(artifact.members, member)]
     mode = "deterministic" if deterministic else "sampled"
     result: dict[str, Any] = {
         "mode": mode,
@@ -56,14 +66,18 @@ def evaluate(
         "members": {},
     }
     world = make_env(result["env"], _kwargs(artifact, env))
-    for name in names:
+    check_spaces(artifact, world)
+    from sauna.trained import TrainedPolicy  # imports JAX, so after the checks
+
+    for name in chosen:
         policy = TrainedPolicy(artifact, name, world)
         played = [play(policy, world, deterministic, seed + i) for i in range(episodes)]
         result["members"][name] = statistics(played)
     world.close()
-    rundir.write_json(run / f"evaluation_{mode}.json", result)
+    if env is None and member is None:
+        rundir.write_json(run / f"evaluation_{mode}.json", result)
     if video:
-        result["video"] = str(film(run, artifact, names[0], env, deterministic, seed))
+        result["video"] = str(film(run, artifact, chosen[0], env, deterministic, seed))
     return result
 
 
@@ -79,6 +93,8 @@ def play(
     watch: Callable[[], None] = lambda: None,
 ) -> tuple[float, int]:
     """One episode; its return (raw rewards) and length in env steps."""
+    import jax
+
     key = jax.random.key(seed)
     observation, _ = env.reset(seed=seed)
     watch()
@@ -117,6 +133,8 @@ def film(
     Raises:
       SaunaError: the environment cannot render on this machine.
     """
+    from sauna.trained import TrainedPolicy
+
     choose_renderer()
     frames: list[np.ndarray] = []
     try:

@@ -109,21 +109,18 @@ def unpack_member(
 ) -> tuple[TrainState, Counters]:
     """Puts member `p` of the collector and its environments back; its learning state.
 
-    Without `replay` the environments stay at the start of an episode of their own.
+    Without `replay` each environment starts the episode after the one it was in.
 
     Raises:
       NotRestored: a replayed environment shows another observation than the stored one.
     """
-    own = {key[len(name) + 1 :]: value for key, value in arrays.items()
-           if key.startswith(name + "/")}  # fmt: skip
-    named = {key[len("params/") :]: value for key, value in own.items()
-             if key.startswith("params/")}  # fmt: skip
+    own = under(name + "/", arrays)
     adam = optax.ScaleByAdamState(
         jnp.asarray(own["adam/count"]),
         jnp.asarray(own["adam/mean"]),
         jnp.asarray(own["adam/variance"]),
     )
-    state = TrainState(flat_params(policy, example.params, named), adam)
+    state = TrainState(flat_params(policy, example.params, under("params/", own)), adam)
     counters = Counters(
         **{
             part.name: own[f"counters/{part.name}"].tolist()
@@ -137,22 +134,26 @@ def unpack_member(
     if replay:
         for key in ("observation", "discounted_return", "episode_return", "episode_length"):
             getattr(collect, key)[p] = own[f"collect/{key}"]
-        _replay(name, p, own, collector, envs)
+    number = len(collect.observation[p])
+    for n in range(number):
+        snapshot = under(f"envs/{n}/", own)
+        if replay:
+            seen = envs.restore(p * number + n, snapshot)
+            _check_replayed(name, n, collect.observation[p, n], seen)
+        else:
+            collect.observation[p, n] = envs.start_after(p * number + n, snapshot)
     return state, counters
 
 
-def _replay(
-    name: str, p: int, own: Mapping[str, np.ndarray], collector: HostCollector, envs: HostEnvs
-) -> None:
-    stored = collector.state.observation[p]
-    for n in range(len(stored)):
-        prefix = f"envs/{n}/"
-        snapshot = {key[len(prefix) :]: value for key, value in own.items()
-                    if key.startswith(prefix)}  # fmt: skip
-        seen = envs.restore(p * len(stored) + n, snapshot)
-        if not np.array_equal(seen, stored[n]):
-            raise NotRestored(
-                f"{name}: environment {n} is not deterministic: replaying its episode ended at "
-                f"another observation than the checkpoint's; resume with --inexact to start new "
-                f"episodes instead"
-            )
+def under(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays whose names start with `prefix`, without it."""
+    return {key[len(prefix) :]: a for key, a in arrays.items() if key.startswith(prefix)}
+
+
+def _check_replayed(name: str, n: int, stored: np.ndarray, seen: np.ndarray) -> None:
+    if not np.array_equal(seen, stored):
+        raise NotRestored(
+            f"{name}: environment {n} is not deterministic: replaying its episode ended at "
+            f"another observation than the checkpoint's; resume with --inexact to start new "
+            f"episodes instead"
+        )

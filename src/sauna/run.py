@@ -14,30 +14,57 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna import checkpoint, rundir
-from sauna.config import Config, check_read, to_json
+from sauna.config import FIELDS, Config, check_read, parse, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe, probe
-from sauna.errors import BadInput
+from sauna.errors import BadInput, nearest, one_line
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
-from sauna.presets import Member, members, resolve, stored_config
+from sauna.presets import ARMS, Member, members, resolve, stored_config
 from sauna.spaces import Spaces
+from sauna.worker import configure_jax
 
 # Fields that `resume` may change: they do not touch what is computed.
 RESUMABLE = ("processes", "env_processes", "env_timeout", "checkpoint_every", "keep_checkpoints",
              "tensorboard")  # fmt: skip
 
 
+def plain(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a user gave, as JSON values; `None` is not given.
+
+    Raises:
+      BadInput: an unknown key, or a value that cannot be read.
+    """
+    for name in given:
+        if name not in FIELDS:
+            raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
+    parsed = {name: parse(name, value) for name, value in given.items() if value is not None}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}
+
+
+def local_parts(config: Config) -> list[str]:
+    """The fields whose values were passed by value and only this process knows."""
+    return [
+        name for name, value in to_json(config).items() if str(value).startswith("sauna.local:")
+    ]
+
+
 class Run:
     """One run on disk, ready to be trained further."""
 
     def __init__(
-        self, path: Path, given: dict[str, Any], config: Config, found: Probe, held: IO[str]
+        self,
+        path: Path,
+        given: dict[str, Any],
+        config: Config,
+        found: Probe,
+        drop_rates: list[list[float]],
     ) -> None:
-        self.path, self.given, self.config, self.held = path, given, config, held
+        self.path, self.given, self.config = path, given, config
         self.spaces, self.differs = found
         self.members: list[Member] = members(config, given)
-        self.drop_rates = _drop_rates(self.members)
+        self.drop_rates = drop_rates
+        self.held: IO[str] = rundir.lock(path)
 
     def manifest(self) -> dict[str, Any]:
         return {
@@ -55,50 +82,74 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
     """
-    given = dict(given)
+    given = plain(given)
     config = resolve(given)
     found = probe(config.env, json.loads(config.env_kwargs))
     config = settle(config, found.spaces)
-    _check_read_after_settling(config, given)
-    _drop_rates(members(config, given))
+    _check_read_after_settling(found.spaces, config, given)
+    drop_rates = _drop_rates(members(config, given))
     TensorBoard.check(config)
     _check_plugins(config, found.spaces)
     path = Path(config.out) if config.out else rundir.default_path(config.env, config.arm)
     config = dataclasses.replace(config, out=str(path))
+    stored = {
+        "given": given,
+        "config": to_json(config),
+        "spaces": list(found.spaces),
+        "drop_rates": drop_rates,
+        "exact_resume": found.differs is None,
+        "versions": rundir.versions(),
+        "git": rundir.git_revision(),
+        "machine": rundir.machine(),
+    }
     rundir.create(path)
-    run = Run(path, given, config, found, rundir.lock(path))
-    rundir.write_json(
-        path / "config.json",
-        {
-            "given": given,
-            "config": to_json(config),
-            "spaces": list(found.spaces),
-            "exact_resume": found.differs is None,
-            "versions": rundir.versions(),
-            "git": rundir.git_revision(),
-            "machine": rundir.machine(),
-        },
-    )
+    run = Run(path, given, config, found, drop_rates)
+    rundir.write_json(path / "config.json", stored)
     if found.differs:
         display.say(
             f"warning: {config.env} does not repeat itself ({found.differs}): this run can be "
             f"continued, but not resumed exactly"
         )
+    if local_parts(config):
+        display.say(
+            f"note: {', '.join(local_parts(config))} cannot be imported by name: this run trains "
+            f"in this process, and can be resumed only from Python, passing the same again"
+        )
     return run
 
 
-def _check_read_after_settling(config: Config, given: Mapping[str, Any]) -> None:
-    """What the observations decided (images take no MLP, no moments) may leave a value unread."""
+def _check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
+    """Refuses what the environment's spaces leave unread.
+
+    Raises:
+      BadInput: naming the field.
+    """
     names = ("hidden", "activation", "clip_observations")
     check_read([config], {name: given[name] for name in names if name in given})
+    if "log_std_init" in given and spaces.action_kind != "continuous":
+        raise BadInput(f"log_std_init: not read with {spaces.action_kind} actions")
+    wanted = "normalize_observations" in given and resolve(given).normalize_observations
+    if wanted and not config.normalize_observations:
+        raise BadInput(f"normalize_observations: {spaces.observation_kind} observations have "
+                           f"no running moments")  # fmt: skip
 
 
 def _check_plugins(config: Config, spaces: Spaces) -> None:
-    """Builds the program here where the user brought parts of it: a mistake is bad input then."""
+    """Builds the program here where the user brought parts of it: a mistake is bad input then.
+
+    Raises:
+      BadInput: a part cannot be used.
+    """
     if any(":" in name for name in (config.network, config.filter, config.vex_target)):
+        configure_jax()
         from sauna.core.population import make_program
 
-        make_program(config, spaces)
+        try:
+            make_program(config, spaces)
+        except BadInput:
+            raise
+        except Exception as error:  # a user's part fails in its own way
+            raise BadInput(f"a part of your own cannot be used: {one_line(error)}") from error
 
 
 def settle(config: Config, spaces: Spaces) -> Config:
@@ -141,23 +192,34 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     resolved = resolve(given)
     config = stored_config(stored.get("config", {}))
     config = dataclasses.replace(config, **{name: getattr(resolved, name) for name in changes})
+    TensorBoard.check(config)
     found = probe(config.env, json.loads(config.env_kwargs))
     config = settle(config, found.spaces)
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
         raise BadInput(f"{config.env} has other spaces than when the run started: "
                        f"{found.spaces} instead of {stored['spaces']}")  # fmt: skip
-    return Run(path, dict(given), config, found, rundir.lock(path))
+    return Run(path, dict(given), config, found, stored["drop_rates"])
 
 
 def _drop_rates(everyone: list[Member]) -> list[list[float]]:
-    """Per member, the drop rate of every iteration of the run it is to repeat."""
+    """Per member, the drop rate that the run it repeats had in every iteration.
+
+    Raises:
+      BadInput: that run is not complete, lacks a seed, or is not of exactly one filtered arm.
+    """
     source = everyone[0].config.drop_rate_from
     if not source:
         return []
+    arms = rundir.read_config(Path(source))["config"]["arm"]
+    filtered = [arm for arm in arms if ARMS[arm]["filter"] != "none"]
+    if len(filtered) != 1:
+        raise BadInput(f"drop_rate_from: {source} has {len(filtered)} filtered arms; it needs one")
+    if not rundir.is_complete(Path(source)):
+        raise BadInput(f"drop_rate_from: {source} is not complete")
     rates: dict[int, list[float]] = {}
-    rundir.read_config(Path(source))
     for row in rundir.rows(Path(source)):
-        rates.setdefault(row["seed"], []).append(1.0 - row["keep_rate"])
+        if row["arm"] == filtered[0]:
+            rates.setdefault(row["seed"], []).append(1.0 - row["keep_rate"])
     for member in everyone:
         if member.seed not in rates:
             raise BadInput(f"drop_rate_from: {source} has no rows of seed {member.seed}")
@@ -171,16 +233,19 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
       Interrupted: a signal came; the state is saved.
       SaunaError: something failed; the last good checkpoint is on disk.
     """
-    loaded = None
-    if resume:
-        if rundir.is_complete(run.path):
-            display.say(f"{run.path} is complete; nothing to do")
-            return
-        loaded = checkpoint.load_newest(run.path / "checkpoints", display.say)
-        _check_same(run, loaded)
-        rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
-    with Coordinator(run, display, loaded, inexact) as coordinator:
-        coordinator.run()
+    try:
+        loaded = None
+        if resume:
+            if rundir.is_complete(run.path):
+                display.say(f"{run.path} is complete; nothing to do")
+                return
+            loaded = checkpoint.load_newest(run.path / "checkpoints", display.say)
+            _check_same(run, loaded)
+            rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+        with Coordinator(run, display, loaded, inexact) as coordinator:
+            coordinator.run()
+    finally:
+        run.held.close()
 
 
 def _check_same(run: Run, loaded: checkpoint.Checkpoint | None) -> None:

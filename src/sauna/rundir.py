@@ -40,7 +40,7 @@ def create(path: Path) -> None:
     Raises:
       BadInput: it holds something already, or cannot be made.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - {".lock"}):
         hint = f"; `sauna resume {path}` continues it" if (path / "config.json").exists() else ""
         raise BadInput(f"out: {path} is not empty{hint}")
     try:
@@ -119,6 +119,12 @@ def is_complete(run: Path) -> bool:
 
 
 def log_sizes(run: Path) -> dict[str, int]:
+    """Bytes of each log, all of them flushed to disk: a checkpoint counts on them."""
+    for name in LOGS:
+        if (run / name).exists():
+            descriptor = os.open(run / name, os.O_RDONLY)
+            os.fsync(descriptor)
+            os.close(descriptor)
     return {name: (run / name).stat().st_size for name in LOGS if (run / name).exists()}
 
 

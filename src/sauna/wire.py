@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -125,7 +126,13 @@ def start_thread(serve: Callable[[Connection, Connection], None]) -> Worker:
 
 
 def child_ends(arguments: list[str]) -> tuple[Connection, Connection]:
-    """In the child: `(inbox, outbox)` from its command line."""
+    """In the child: `(inbox, outbox)` from its command line.
+
+    Signals are the parent's business (schedulers send them to every process): a child ends when
+    its inbox closes.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return (
         Connection(int(arguments[0]), writable=False),
         Connection(int(arguments[1]), readable=False),

@@ -48,7 +48,7 @@ def make_trunk(config: Config, spaces: Spaces) -> Callable[[str], nn.Module]:
     """A function that builds the trunk `config.network` names.
 
     Raises:
-      BadInput: a user's `module:name` is not a flax module or a function that returns one.
+      BadInput: a user's `module:name` is not a flax module.
     """
     if config.network == "mlp":
         return partial(_named, MLP, hidden=config.hidden, activation=config.activation)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from sauna.config import Config
 from sauna.core.batch import make_batch
@@ -40,19 +39,12 @@ class Program(NamedTuple):
 
 
 def map_members(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of one member, over a leading axis of members.
+    """`function` of one member, over a leading axis of members, one after the other.
 
-    On CPU a `lax.map`: a batched product rounds differently for 6 members than for 1, and training
-    amplifies the difference. On accelerators a `vmap`, where members agree to rounding only.
+    Not a `vmap`: a batched product rounds differently for 6 members than for 1, and training
+    amplifies the difference.
     """
-    if jax.default_backend() == "cpu":
-        return lambda *arguments: jax.lax.map(lambda x: function(*x), arguments)
-    return jax.vmap(function)
-
-
-def stack(trees: Sequence[Any]) -> Any:
-    """Members' pytrees -> one pytree with a leading member axis."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+    return lambda *arguments: jax.lax.map(lambda x: function(*x), arguments)
 
 
 def make_program(config: Config, spaces: Spaces) -> Program:

@@ -43,6 +43,9 @@ class HostEnvs(Protocol):
     def restore(self, index: int, snapshot: Snapshot) -> np.ndarray:
         """Brings environment `index` to a snapshot's state; its observation `[*obs]` there."""
 
+    def start_after(self, index: int, snapshot: Snapshot) -> np.ndarray:
+        """Starts the episode after a snapshot's instead; its first observation `[*obs]`."""
+
     def close(self) -> None: ...
 
 

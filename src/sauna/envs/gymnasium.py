@@ -18,7 +18,7 @@ import numpy as np
 
 from sauna.config import import_name
 from sauna.envs.contract import HostEnvs, Snapshot, Step, episode_seed
-from sauna.errors import BadInput, SaunaError, nearest
+from sauna.errors import BadInput, SaunaError, nearest, one_line
 from sauna.spaces import action_writer, describe, observation_reader
 
 _GYMNASIUM_ID = re.compile(r"^(?:[\w.-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
@@ -45,8 +45,8 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
     if module:
         try:
             importlib.import_module(module)
-        except ImportError as error:
-            raise BadInput(f"env: cannot import {module!r}: {error}") from error
+        except Exception as error:
+            raise BadInput(f"env: cannot import {module!r}: {one_line(error)}") from error
     if name not in gymnasium.registry:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
     if "mujoco" in str(gymnasium.registry[name].entry_point):
@@ -71,11 +71,7 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
     try:
         return maker(**more)
     except Exception as error:  # whatever a user's environment raises when made
-        raise BadInput(f"env: {env} cannot be made: {_one_line(error)}") from error
-
-
-def _one_line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".replace("\n", " ")[:300]
+        raise BadInput(f"env: {env} cannot be made: {one_line(error)}") from error
 
 
 class _Slot:
@@ -116,6 +112,7 @@ class GymnasiumEnvs(HostEnvs):
         for index, slot in enumerate(self._slots):
             slot.episode = -1
             self._start_episode(index, slot)
+        self._check_finite(np.ones(len(self._slots), bool))
         return self._observation.copy()
 
     def _start_episode(self, index: int, slot: _Slot) -> None:
@@ -124,7 +121,7 @@ class GymnasiumEnvs(HostEnvs):
         try:
             observation, _ = slot.env.reset(seed=episode_seed(*slot.seeds, slot.episode))
         except Exception as error:
-            raise EnvironmentFailure(f"{slot.name}: reset raised {_one_line(error)}") from error
+            raise EnvironmentFailure(f"{slot.name}: reset raised {one_line(error)}") from error
         self._observation[index] = self._read(observation)
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
@@ -140,13 +137,14 @@ class GymnasiumEnvs(HostEnvs):
         try:
             observation, reward, terminated, truncated, _ = slot.env.step(self._write(action))
         except Exception as error:
-            raise EnvironmentFailure(f"{slot.name}: step raised {_one_line(error)}") from error
+            raise EnvironmentFailure(f"{slot.name}: step raised {one_line(error)}") from error
         self._reward[index] = reward
         if terminated or truncated:
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
             self._final[index] = self._read(observation)
             self._final_sum = self._final.sum()
+            self._check_finite(np.arange(len(self._slots)) == index)
             self._start_episode(index, slot)
         else:
             self._observation[index] = self._read(observation)
@@ -180,6 +178,12 @@ class GymnasiumEnvs(HostEnvs):
             slot.actions.append(action)
             observation = slot.env.step(self._write(action))[0]
             self._observation[index] = self._read(observation)
+        return self._observation[index].copy()
+
+    def start_after(self, index: int, snapshot: Snapshot) -> np.ndarray:
+        slot = self._slots[index]
+        slot.episode = int(snapshot["episode"])
+        self._start_episode(index, slot)
         return self._observation[index].copy()
 
     def close(self) -> None:

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.envs.gymnasium import make_env
+from sauna.errors import BadInput, one_line
 from sauna.spaces import Spaces, describe, observation_reader
 
 STEPS = 25
 
 
 class Probe(NamedTuple):
-    """`repeats` is None where the environment gave the same episode twice, else what differed."""
+    """`differs` is None where the environment gave the same episode twice."""
 
     spaces: Spaces
     differs: str | None
@@ -26,13 +27,17 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     seen too.
 
     Raises:
-      BadInput: the environment cannot be made, or its spaces are not supported.
+      BadInput: the environment cannot be made or played, or its spaces are not supported.
     """
     first, second = make_env(env, env_kwargs), make_env(env, env_kwargs)
     try:
         spaces = describe(first.observation_space, first.action_space)
         _play(first, seed=1)
         differs = _difference(_play(first, seed=2), _play(second, seed=2))
+    except BadInput:
+        raise
+    except Exception as error:  # whatever a user's environment raises when played
+        raise BadInput(f"env: {env} cannot be played: {one_line(error)}") from error
     finally:
         first.close()
         second.close()

@@ -39,36 +39,53 @@ class ProcessEnvs(HostEnvs):
         self._workers = [start_worker(__name__, {"OMP_NUM_THREADS": "1"}) for _ in self._parts]
         for worker, part in zip(self._workers, self._parts, strict=True):
             chosen = [list(seeds[i]) for i in part]
-            worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen})
+            try:
+                worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen})
+            except BrokenPipeError:
+                pass  # named when its answer is read
         answers = [self._answer(number) for number in range(processes)]
         self.spaces = read_spaces(answers[0].header["spaces"])
 
     def reset(self) -> np.ndarray:
-        for worker in self._workers:
-            worker.say({"kind": "reset"})
+        for number in range(len(self._workers)):
+            self._say(number, {"kind": "reset"})
         return np.concatenate(
             [self._answer(k).arrays["observation"] for k in range(len(self._workers))]
         )
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
-        for worker, part in zip(self._workers, self._parts, strict=True):
-            worker.say({"kind": "step"}, {"action": action[part], "active": active[part]})
+        for number, part in enumerate(self._parts):
+            arrays = {"action": action[part], "active": active[part]}
+            self._say(number, {"kind": "step"}, arrays)
         answers = [self._answer(number).arrays for number in range(len(self._workers))]
         return Step(*(np.concatenate([a[name] for a in answers]) for name in Step._fields))
 
     def snapshot(self, index: int) -> Snapshot:
         number, local = self._find(index)
-        self._workers[number].say({"kind": "snapshot", "index": local})
+        self._say(number, {"kind": "snapshot", "index": local})
         return self._answer(number).arrays
 
     def restore(self, index: int, snapshot: Snapshot) -> np.ndarray:
         number, local = self._find(index)
-        self._workers[number].say({"kind": "restore", "index": local}, snapshot)
+        self._say(number, {"kind": "restore", "index": local}, snapshot)
+        return self._answer(number).arrays["observation"]
+
+    def start_after(self, index: int, snapshot: Snapshot) -> np.ndarray:
+        number, local = self._find(index)
+        self._say(number, {"kind": "start_after", "index": local}, snapshot)
         return self._answer(number).arrays["observation"]
 
     def close(self) -> None:
         for worker in self._workers:
             worker.stop()
+
+    def _say(
+        self, number: int, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None
+    ) -> None:
+        try:
+            self._workers[number].say(header, arrays)
+        except BrokenPipeError:
+            self._answer(number)  # reads its last words, or names its end
 
     def _find(self, index: int) -> tuple[int, int]:
         number = next(k for k, part in enumerate(self._parts) if index in part)
@@ -82,7 +99,7 @@ class ProcessEnvs(HostEnvs):
             raise EnvironmentFailure(f"{name} did not answer within {self._timeout:g} s")
         try:
             message = receive(worker.inbox)
-        except EOFError:
+        except (EOFError, ConnectionResetError):
             code = worker.process.wait()
             raise EnvironmentFailure(f"{name} ended with exit code {code}") from None
         if message.header["kind"] == "failure":
@@ -98,7 +115,8 @@ def _serve(envs: GymnasiumEnvs, message: Message) -> dict[str, np.ndarray]:
         return envs.step(arrays["action"], arrays["active"])._asdict()
     if kind == "snapshot":
         return envs.snapshot(message.header["index"])
-    return {"observation": envs.restore(message.header["index"], arrays)}
+    go_on = envs.restore if kind == "restore" else envs.start_after
+    return {"observation": go_on(message.header["index"], arrays)}
 
 
 def main() -> None:

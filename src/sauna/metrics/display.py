@@ -17,7 +17,11 @@ class Display(Protocol):
     """Where a run shows itself. `say` works before `open` and after `close`."""
 
     def say(self, text: str) -> None: ...
-    def open(self, config: Config, members: list[Member], path: Path) -> None: ...
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        """`rows`: those of before, of a run that is resumed."""
+
     def phase(self, process: int, text: str) -> None: ...
     def rows(self, rows: list[dict[str, Any]]) -> None: ...
     def refresh(self) -> None: ...
@@ -32,33 +36,31 @@ def make_display() -> Display:
 class _Progress:
     """Latest row of each member, and the rate since training began."""
 
-    def __init__(self, config: Config, members: list[Member], path: Path) -> None:
-        self.config, self.path = config, path
+    def __init__(self, config: Config, members: list[Member], rows: list[dict[str, Any]]) -> None:
+        self.config = config
         self.latest: dict[str, dict[str, Any] | None] = {m.name: None for m in members}
         self.phases: dict[int, str] = {}
         self.seconds_left: float | None = None
         self.rate: float | None = None
         self._first: tuple[float, int] | None = None
+        for row in rows:
+            self.latest[row["member"]] = row
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
         for row in rows:
             self.latest[row["member"]] = row
-        done, now = self.env_steps, time.monotonic()
+        done, now = sum(map(self.budget_used, self.latest)), time.monotonic()
         if self._first is None:
             if all(self.latest.values()):
                 self._first = (now, done)  # compiling is not counted into the rate
         elif now > self._first[0]:
             self.rate = (done - self._first[1]) / (now - self._first[0])
-            left = sum(self.config.steps - self.budget_used(n) for n in self.latest)
+            left = self.config.steps * len(self.latest) - done
             self.seconds_left = left / self.rate if self.rate else None
 
     def budget_used(self, name: str) -> int:
         row = self.latest[name]
         return row[f"{self.config.budget}_steps"] if row else 0
-
-    @property
-    def env_steps(self) -> int:
-        return sum(row["env_steps"] for row in self.latest.values() if row)
 
     def status(self) -> str:
         """One line: phase or rate, time left."""
@@ -69,7 +71,7 @@ class _Progress:
             waiting = sorted(set(self.phases.values())) or ["starting"]
             return ", ".join(waiting) + ("" if share == 0 else f", {share:.0%}")
         left = "" if self.seconds_left is None else f", {duration(self.seconds_left)} left"
-        return f"{share:.0%}, {self.rate:,.0f} env steps/s{left}"
+        return f"{share:.0%}, {self.rate:,.0f} {self.config.budget} steps/s{left}"
 
 
 def duration(seconds: float) -> str:
@@ -93,8 +95,10 @@ class PlainDisplay:
     def say(self, text: str) -> None:
         print(text, flush=True)
 
-    def open(self, config: Config, members: list[Member], path: Path) -> None:
-        self._progress = _Progress(config, members, path)
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        self._progress = _Progress(config, members, rows)
         self.say(headline(config, members, path))
 
     def phase(self, process: int, text: str) -> None:
@@ -141,10 +145,12 @@ class LiveDisplay:
     def say(self, text: str) -> None:
         self._console.print(text, highlight=False, markup=False)
 
-    def open(self, config: Config, members: list[Member], path: Path) -> None:
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
         from rich.live import Live
 
-        self._progress = _Progress(config, members, path)
+        self._progress = _Progress(config, members, rows)
         self.say(headline(config, members, path))
         self._live = Live(console=self._console, auto_refresh=False, transient=False)
         self._live.start()

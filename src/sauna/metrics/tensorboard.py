@@ -13,7 +13,7 @@ from sauna.errors import BadInput
 class TensorBoard:
     """Writes nothing unless the config asks for it. The x-axis is the member's env steps."""
 
-    def __init__(self, run: Path, config: Config, purge_from: int | None = None) -> None:
+    def __init__(self, run: Path, config: Config) -> None:
         self._folder = run / "tensorboard" if config.tensorboard else None
         self._writers: dict[str, Any] = {}
 

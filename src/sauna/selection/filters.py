@@ -25,6 +25,7 @@ import jax.numpy as jnp
 
 from sauna.config import Config, import_name
 from sauna.core.types import Array, Hypers
+from sauna.errors import BadInput
 
 EPSILON = 1e-8  # epsilon_0 of eq. 7
 
@@ -132,14 +133,21 @@ def random_drop() -> Filter:
 
 
 def make_filter(config: Config) -> Filter | None:
-    """The filter that `config` names, or None where every transition is kept."""
+    """The filter that `config` names, or None where every transition is kept.
+
+    Raises:
+      BadInput: a user's `module:name` is something else.
+    """
     if config.filter == "none":
         return None
     if config.filter == "random-drop":
         return random_drop()
     if config.filter == "sauna":
         return (sauna_joint if config.decision == "joint" else sauna_per_env)(config.history)
-    return import_name("filter", config.filter)
+    filter = import_name("filter", config.filter)
+    if not isinstance(filter, Filter):
+        raise BadInput(f"filter: {config.filter} is not a sauna.Filter")
+    return filter
 
 
 def decide(

@@ -17,8 +17,11 @@ import jax.numpy as jnp
 
 from sauna.config import Config, import_name
 from sauna.core.types import Array
+from sauna.errors import BadInput
 
 CLIP_BELOW = -5.0  # of the per-sample target, whose lower tail is unbounded
+# Variance over mean square below which equal float32 returns are told apart by rounding only.
+ROUNDING = 1e-10
 
 
 class VexTarget(NamedTuple):
@@ -42,16 +45,18 @@ def _mean(x: Array, weight: Array) -> Array:
     )
 
 
-def _explained(unexplained: Array, variance: Array) -> Array:
-    """`1 - unexplained / variance`, and 0 where the variance is 0."""
-    return jnp.where(variance > 0, 1.0 - unexplained / jnp.where(variance > 0, variance, 1.0), 0.0)
+def _explained(unexplained: Array, variance: Array, mean_square: Array) -> Array:
+    """`1 - unexplained / variance`, and 0 where the returns vary by rounding alone."""
+    varies = variance > ROUNDING * mean_square
+    return jnp.where(varies, 1.0 - unexplained / jnp.where(varies, variance, 1.0), 0.0)
 
 
 def rollout_target(return_: Array, value: Array, weight: Array, episode: Array) -> Array:
     """Eq. 5 over each actor's buffer: one number for all states of a column of `[T, N]`."""
     variance = _mean((return_ - _mean(return_, weight)) ** 2, weight)
     unexplained = _mean((return_ - value) ** 2, weight)
-    return jnp.broadcast_to(_explained(unexplained, variance), return_.shape)
+    explained = _explained(unexplained, variance, _mean(return_**2, weight))
+    return jnp.broadcast_to(explained, return_.shape)
 
 
 def minibatch_target(return_: Array, value: Array, weight: Array, episode: Array) -> Array:
@@ -62,7 +67,8 @@ def minibatch_target(return_: Array, value: Array, weight: Array, episode: Array
     residual = return_ - value
     unexplained = _mean((residual - _mean(residual, weight)) ** 2, weight)
     variance = _mean((return_ - _mean(return_, weight)) ** 2, weight)
-    return jnp.broadcast_to(_explained(unexplained, variance), return_.shape)
+    explained = _explained(unexplained, variance, _mean(return_**2, weight))
+    return jnp.broadcast_to(explained, return_.shape)
 
 
 def episode_target(return_: Array, value: Array, weight: Array, episode: Array) -> Array:
@@ -77,7 +83,8 @@ def episode_target(return_: Array, value: Array, weight: Array, episode: Array) 
             return (total / jnp.maximum(number, 1.0))[episode]
 
         variance = over_stretch((return_ - over_stretch(return_)) ** 2)
-        return _explained(over_stretch((return_ - value) ** 2), variance)
+        unexplained = over_stretch((return_ - value) ** 2)
+        return _explained(unexplained, variance, over_stretch(return_**2))
 
     return jax.vmap(column, in_axes=1, out_axes=1)(return_, value, weight, episode)
 
@@ -89,7 +96,8 @@ def sample_target(return_: Array, value: Array, weight: Array, episode: Array) -
     states.
     """
     variance = _mean((return_ - _mean(return_, weight)) ** 2, weight)
-    return jnp.clip(_explained((return_ - value) ** 2, variance), CLIP_BELOW, 1.0)
+    explained = _explained((return_ - value) ** 2, variance, _mean(return_**2, weight))
+    return jnp.clip(explained, CLIP_BELOW, 1.0)
 
 
 TARGETS = {
@@ -101,7 +109,14 @@ TARGETS = {
 
 
 def make_target(config: Config) -> VexTarget:
-    """The target that `config` names."""
+    """The target that `config` names.
+
+    Raises:
+      BadInput: a user's `module:name` is something else.
+    """
     if config.vex_target in TARGETS:
         return TARGETS[config.vex_target]
-    return import_name("vex_target", config.vex_target)
+    target = import_name("vex_target", config.vex_target)
+    if not isinstance(target, VexTarget):
+        raise BadInput(f"vex_target: {config.vex_target} is not a sauna.VexTarget")
+    return target

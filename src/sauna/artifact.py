@@ -1,0 +1,63 @@
+"""What a finished run offers: its newest good checkpoint and what that is of. No JAX here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sauna import checkpoint, rundir
+from sauna.config import Config
+from sauna.errors import BadInput, nearest
+from sauna.presets import stored_config
+from sauna.spaces import Spaces, describe, read_spaces
+
+
+class Artifact(NamedTuple):
+    """The newest good checkpoint of a run and what it is of."""
+
+    config: Config
+    spaces: Spaces
+    members: list[str]
+    checkpoint: checkpoint.Checkpoint
+
+
+def load_artifact(run: Path, warn: Callable[[str], None] = print) -> Artifact:
+    """Reads a run's newest good checkpoint.
+
+    Raises:
+      BadInput: no run there, or no checkpoint yet.
+      BadCheckpoint: none of its checkpoints can be trusted.
+    """
+    rundir.read_config(run)
+    loaded = checkpoint.load_newest(run / "checkpoints", warn)
+    if loaded is None:
+        raise BadInput(f"{run} has no checkpoint yet")
+    spaces = read_spaces(loaded.manifest["spaces"])
+    config = stored_config(loaded.manifest["config"])
+    return Artifact(config, spaces, loaded.manifest["members"], loaded)
+
+
+def find_member(members: list[str], member: str | int) -> str:
+    if isinstance(member, int) or member.isdigit():
+        index = int(member)
+        if not 0 <= index < len(members):
+            raise BadInput(f"member: {index} is not between 0 and {len(members) - 1}")
+        return members[index]
+    if member not in members:
+        raise BadInput(f"member: unknown member {member!r}{nearest(member, members)}")
+    return member
+
+
+def check_spaces(artifact: Artifact, env: Any) -> None:
+    """Refuses an environment whose spaces are not the run's.
+
+    Raises:
+      BadInput: naming the space that differs.
+    """
+    found = describe(env.observation_space, env.action_space)
+    for part in ("observation_text", "action_text"):
+        ours, theirs = getattr(artifact.spaces, part), getattr(found, part)
+        if ours != theirs:
+            kind = part.split("_")[0]
+            raise BadInput(f"env: the run's {kind} space is {ours}, this environment's {theirs}")
