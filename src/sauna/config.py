@@ -351,7 +351,7 @@ def check_consistent(config: Config) -> None:
         raise BadInput("drop_rate: give either drop_rate or drop_rate_from, not both")
     if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):
         raise BadInput("drop_rate: random-drop needs a rate, or drop_rate_from=RUN")
-    if config.env_processes and config.env.startswith("sauna.local:"):
+    if config.env_processes and "env" in local_parts(config):
         raise BadInput("env_processes: the environment cannot be imported by another process; "
                        "put it at the top level of a module")  # fmt: skip
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
@@ -399,6 +399,11 @@ def name_of(thing: Any) -> str:
     name = "".join(c if c.isalnum() else "_" for c in name or type(thing).__name__)
     setattr(local, name, thing)
     return f"{local.__name__}:{name}"
+
+
+def local_parts(config: Config) -> list[str]:
+    """The fields whose values were passed by value and only this process knows."""
+    return [name for name in FIELDS if str(getattr(config, name)).startswith("sauna.local:")]
 
 
 def to_json(config: Config) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sauna import checkpoint, rundir
-from sauna.config import to_json
+from sauna.config import local_parts, to_json
 from sauna.errors import Interrupted, SaunaError
 from sauna.metrics.curve import draw_curve
 from sauna.metrics.display import Display
@@ -66,7 +66,7 @@ class Coordinator:
         self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
     ) -> Worker:
         run = self._run
-        if any(str(v).startswith("sauna.local:") for v in to_json(run.config).values()):
+        if local_parts(run.config):
             worker = start_thread(partial(serve, dies_alone=False))
         else:
             worker = start_worker("sauna.worker", {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1",

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna import checkpoint, rundir
-from sauna.config import FIELDS, Config, check_read, parse, to_json
+from sauna.config import FIELDS, Config, check_read, local_parts, parse, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe, probe
 from sauna.errors import BadInput, nearest, one_line
@@ -40,13 +40,6 @@ def plain(given: Mapping[str, Any]) -> dict[str, Any]:
             raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
     parsed = {name: parse(name, value) for name, value in given.items() if value is not None}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}
-
-
-def local_parts(config: Config) -> list[str]:
-    """The fields whose values were passed by value and only this process knows."""
-    return [
-        name for name, value in to_json(config).items() if str(value).startswith("sauna.local:")
-    ]
 
 
 class Run:
