@@ -83,7 +83,7 @@ def resolve(given: Mapping[str, Any]) -> Config:
     Raises:
       BadInput: an unknown key, arm or preset (naming the nearest), or impossible values.
     """
-    parsed = _parse_all(given)
+    parsed = parse_all(given)
     arms = parsed.get("arm", FIELDS["arm"].default)
     _check_arms(arms, parsed)
     configs = [_arm_config(arm, parsed) for arm in arms]
@@ -97,7 +97,7 @@ def resolve(given: Mapping[str, Any]) -> Config:
 
 def members(config: Config, given: Mapping[str, Any]) -> list[Member]:
     """All members of a run, arm by arm and seed by seed; each with its own arm's config."""
-    parsed = _parse_all(given)
+    parsed = parse_all(given)
     return [
         Member(f"{arm}/{seed}", arm, seed, _member_config(arm, parsed, config))
         for arm in config.arm
@@ -105,7 +105,12 @@ def members(config: Config, given: Mapping[str, Any]) -> list[Member]:
     ]
 
 
-def _parse_all(given: Mapping[str, Any]) -> dict[str, Any]:
+def parse_all(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Each given value as its field's type.
+
+    Raises:
+      BadInput: an unknown key, or a value that cannot be read.
+    """
     for name in given:
         if name not in FIELDS:
             raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
@@ -161,7 +166,7 @@ def stored_config(stored: Mapping[str, Any]) -> Config:
     missing = [name for name in FIELDS if name not in stored]
     if missing:
         raise BadInput(f"config: {missing[0]!r} is missing")
-    return Config(**_parse_all(stored))
+    return Config(**parse_all(stored))
 
 
 def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

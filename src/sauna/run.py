@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna import checkpoint, rundir
-from sauna.config import FIELDS, Config, check_read, local_parts, parse, to_json
+from sauna.config import Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe, probe
-from sauna.errors import BadInput, nearest, one_line
+from sauna.errors import BadInput, one_line
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
-from sauna.presets import ARMS, Member, members, resolve, stored_config
+from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_config
 from sauna.spaces import Spaces
 from sauna.worker import configure_jax
 
@@ -35,10 +35,7 @@ def plain(given: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
       BadInput: an unknown key, or a value that cannot be read.
     """
-    for name in given:
-        if name not in FIELDS:
-            raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
-    parsed = {name: parse(name, value) for name, value in given.items() if value is not None}
+    parsed = parse_all({name: value for name, value in given.items() if value is not None})
     return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}
 
 

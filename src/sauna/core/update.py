@@ -46,6 +46,14 @@ def init_state(policy: Policy, key: Array) -> TrainState:
     return TrainState(params, optax.scale_by_adam().init(params))
 
 
+def vex_targets(batch: Batch, target: VexTarget) -> Array:
+    """Targets `[B]`: the batch's own, or computed on it if the target is one per minibatch."""
+    if not target.per_minibatch:
+        return batch.vex_target
+    one_episode = jnp.zeros(batch.value.shape, jnp.int32)
+    return target.target(batch.return_, batch.value, batch.weight, one_episode)
+
+
 def minibatch_losses(
     params: Array,
     batch: Batch,
@@ -60,10 +68,7 @@ def minibatch_losses(
     advantage = batch.advantage
     if config.normalize_advantages:
         advantage = standardize(advantage, batch.weight)
-    vex_target = batch.vex_target
-    if target.per_minibatch:
-        one_episode = jnp.zeros(batch.value.shape, jnp.int32)
-        vex_target = target.target(batch.return_, batch.value, batch.weight, one_episode)
+    vex_target = vex_targets(batch, target)
     return combine(
         policy.distribution.log_prob(output.policy, batch.action) - batch.log_prob,
         advantage,
@@ -152,11 +157,7 @@ def learn(
     target: VexTarget,
 ) -> tuple[TrainState, UpdateMetrics]:
     """The update and everything that is logged about it."""
-    vex_target = batch.vex_target
-    if target.per_minibatch:  # logged as what it would be over the whole batch
-        one_episode = jnp.zeros(batch.value.shape, jnp.int32)
-        vex_target = target.target(batch.return_, batch.value, batch.weight, one_episode)
-    mean_target = weighted_mean(vex_target, batch.weight)
+    mean_target = weighted_mean(vex_targets(batch, target), batch.weight)
     state, losses, gradient_norm = update(
         state, batch, hypers, key, config=config, policy=policy, target=target
     )
