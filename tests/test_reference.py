@@ -162,12 +162,15 @@ class Setup:
 
     def collect(self, iteration: int):
         limit = np.array([_limit(self.config, Counters())])
-        collected = self.collector.collect(self.params[None], [self.hypers], iteration, limit)[0]
+        collected = self.collector.collect(
+            np.asarray(self.params)[None], [self.hypers], iteration, limit
+        )[0]
         return collected, self.program.make_batch(collected.rollout, self.hypers)
 
     def act(self, seen, noise):
-        packed = np.asarray(self.program.act(self.params[None], seen[None], noise[None]))[0]
-        return packed[:, :2], packed[:, 2], packed[:, 3], packed[:, 4]
+        action = np.asarray(self.program.act(self.params[None], seen[None], noise[None]))[0]
+        scores = np.asarray(self.program.score(self.params, seen[None], action[None]))[0]
+        return action, *scores.T
 
     def value(self, seen):
         return np.asarray(self.program.value(self.params, seen))

@@ -78,6 +78,12 @@ class Config:
         at_least=0,
         shapes_program=False,
     )
+    backend: str = option(
+        "auto",
+        "what steps the environments (auto: a fast path with the same bits where there is one)",
+        choices=("auto", "gymnasium"),
+        shapes_program=False,
+    )
     env_timeout: float = option(
         60.0, "seconds to wait for an environment worker", above=0, shapes_program=False
     )

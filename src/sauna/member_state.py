@@ -84,13 +84,9 @@ def pack_member(
     for key, value in dataclasses.asdict(counters).items():
         dtype = np.float64 if isinstance(value, list) else np.int64
         arrays[f"counters/{key}"] = np.asarray(value, dtype)
-    collect = collector.state
-    for moments in ("observation_moments", "reward_moments"):
-        for part, value in getattr(collect, moments)._asdict().items():
-            arrays[f"{moments}/{part}"] = value[p]
-    for key in ("observation", "discounted_return", "episode_return", "episode_length"):
-        arrays[f"collect/{key}"] = getattr(collect, key)[p]
-    number = collect.episode_length.shape[1]
+    for key, value in (moments_of(collector, p) | collected_of(collector, p)).items():
+        arrays[key] = value
+    number = collector.state.episode_length.shape[1]
     for n in range(number):
         for key, value in envs.snapshot(p * number + n).items():
             arrays[f"envs/{n}/{key}"] = value
@@ -127,13 +123,12 @@ def unpack_member(
             for part in dataclasses.fields(Counters)
         }
     )
-    collect = collector.state
-    for moments in ("observation_moments", "reward_moments"):
-        for part in Moments._fields:
-            getattr(getattr(collect, moments), part)[p] = own[f"{moments}/{part}"]
+    for key, place in moments_of(collector, p).items():
+        place[...] = own[key]
     if replay:
-        for key in ("observation", "discounted_return", "episode_return", "episode_length"):
-            getattr(collect, key)[p] = own[f"collect/{key}"]
+        for key, place in collected_of(collector, p).items():
+            place[...] = own[key]
+    collect = collector.state
     number = len(collect.observation[p])
     for n in range(number):
         snapshot = under(f"envs/{n}/", own)
@@ -143,6 +138,23 @@ def unpack_member(
         else:
             collect.observation[p, n] = envs.start_after(p * number + n, snapshot)
     return state, counters
+
+
+def moments_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
+    """Views of member `p`'s running moments, by their names in a checkpoint."""
+    parts = {"reward_moments": Moments(*(part[p] for part in collector.reward_moments))}
+    if collector.observation_moments is not None:
+        parts["observation_moments"] = collector.observation_moments.of(p)
+    return {
+        f"{kind}/{name}": value
+        for kind, moments in parts.items()
+        for name, value in moments._asdict().items()
+    }
+
+
+def collected_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
+    """Views of what member `p` carries from one rollout to the next, by their names."""
+    return {f"collect/{key}": value[p] for key, value in collector.state._asdict().items()}
 
 
 def under(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -25,8 +25,8 @@ from sauna.spaces import Spaces
 from sauna.worker import configure_jax
 
 # Fields that `resume` may change: they do not touch what is computed.
-RESUMABLE = ("processes", "env_processes", "env_timeout", "checkpoint_every", "keep_checkpoints",
-             "tensorboard")  # fmt: skip
+RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "checkpoint_every",
+             "keep_checkpoints", "tensorboard")  # fmt: skip
 
 
 def plain(given: Mapping[str, Any]) -> dict[str, Any]:

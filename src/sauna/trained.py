@@ -45,7 +45,8 @@ class TrainedPolicy:
         example = jax.eval_shape(self._policy.init, jax.random.key(0))
         zeros = jnp.zeros(example.shape, example.dtype)
         self._params = flat_params(self._policy, zeros, under("params/", own))
-        self._moments = Moments(**under("observation_moments/", own))
+        if self.config.normalize_observations:
+            self._moments = Moments(**under("observation_moments/", own))
         self._dtype = artifact.spaces.observation_dtype
         self._act = jax.jit(self._choose, static_argnames="deterministic")
 

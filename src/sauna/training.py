@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sauna.collect.host import Collected, HostCollector, capacity
@@ -20,8 +19,8 @@ from sauna.config import Config
 from sauna.core.population import Keys, Program, make_program, member_keys
 from sauna.core.types import Hypers, TrainState
 from sauna.core.update import UpdateMetrics
+from sauna.envs.backend import in_process_envs
 from sauna.envs.contract import HostEnvs
-from sauna.envs.gymnasium import GymnasiumEnvs, env_maker
 from sauna.envs.workers import ProcessEnvs
 from sauna.errors import SaunaError
 from sauna.member_state import Counters, pack_member, unpack_member
@@ -85,7 +84,7 @@ def train_members(job: Job, reporter: Reporter) -> None:
             clock = time.perf_counter()
             hypers = [_hypers(job, p, counters[p], iteration) for p in range(len(members))]
             limit = np.array([_limit(config, c) for c in counters])
-            params = jnp.stack([state.params for state in states])
+            params = np.stack([np.asarray(state.params) for state in states])
             collected = collector.collect(params, hypers, iteration, limit)
             collect_seconds = time.perf_counter() - clock
             rows = []
@@ -123,8 +122,10 @@ def make_envs(job: Job) -> HostEnvs:
     seeds = [(member.seed, n) for member in job.members for n in range(config.envs)]
     if config.env_processes:
         processes = min(config.env_processes, len(seeds))
-        return ProcessEnvs(config.env, job.env_kwargs, seeds, processes, config.env_timeout)
-    return GymnasiumEnvs(env_maker(config.env, job.env_kwargs), seeds)
+        return ProcessEnvs(
+            config.env, job.env_kwargs, seeds, processes, config.env_timeout, config.backend
+        )
+    return in_process_envs(config.env, job.env_kwargs, seeds, config.backend)
 
 
 def _start(

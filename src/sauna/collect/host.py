@@ -1,7 +1,8 @@
 """Collecting rollouts from host environments, for all members of a process in lockstep.
 
-Acting and filtering are separate: the policy acts for a stretch of steps, then the filter decides
-about the whole stretch in one call. A decision never changes how an env acts, so this gives the
+Acting, scoring and filtering are separate: the policy acts for a stretch of steps, then one
+compiled call per member computes log-probabilities, values and Vex of the whole stretch, and one
+more lets the filter decide about it. A decision never changes how an env acts, so this gives the
 mask that deciding after each step would give. With `dropped="replace"` a stretch is as long as the
 smallest number of steps that some env still lacks: no env can overshoot.
 """
@@ -13,10 +14,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from sauna.collect.actor import make_actor
+from sauna.collect.moments import (
+    ObservationMoments,
+    discounted_returns,
+    moments_after_each,
+    scale_rewards,
+)
 from sauna.config import Config
-from sauna.core.normalize import Moments, initial_moments, normalize, scale, update_moments
+from sauna.core.normalize import Moments, initial_moments, normalize
 from sauna.core.population import Keys, Program
-from sauna.core.types import Array, Hypers, Rollout
+from sauna.core.types import Hypers, Rollout
 from sauna.envs.contract import HostEnvs, Step
 from sauna.spaces import Spaces
 
@@ -25,8 +33,6 @@ class CollectState(NamedTuple):
     """What persists between rollouts; arrays with a leading member axis P, changed in place."""
 
     observation: np.ndarray  # [P, N, *obs] float64 or uint8, as the env gave it
-    observation_moments: Moments  # [P, D]
-    reward_moments: Moments  # [P, 1], of the discounted return
     discounted_return: np.ndarray  # [P, N] float64
     episode_return: np.ndarray  # [P, N] float64, raw rewards so far
     episode_length: np.ndarray  # [P, N] int64
@@ -51,13 +57,12 @@ class Collected(NamedTuple):
     episodes: list[Episode]
 
 
-class _Ending(NamedTuple):
-    row: int
-    env: int
-    return_: float
-    length: int
-    truncated: bool
-    final_value: float
+class _Stretch(NamedTuple):
+    """Rows `first` to `last` of one member, in which the envs of `acting` `[N]` act."""
+
+    first: int
+    last: int  # 0: the member has finished its rollout
+    acting: np.ndarray
 
 
 class HostCollector:
@@ -74,25 +79,28 @@ class HostCollector:
         self._program, self._config, self._spaces = program, program.config, spaces
         self._envs, self._keys = envs, keys
         self._shape = (len(keys), self._config.envs)
-        self._normalizes = (
-            self._config.normalize_observations and spaces.observation_kind == "vector"
-        )
+        self._actor = make_actor(self._config, spaces, program.policy, program.act, len(keys))
         self._capacity = capacity(self._config)
         self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
-        self.state = self._initial_state()
-
-    def _initial_state(self) -> CollectState:
-        members, shape = self._shape[0], self._shape
-        size = int(np.prod(self._spaces.observation_shape)) if self._normalizes else 1
-        dtype = np.uint8 if self._spaces.observation_kind == "image" else np.float64
-        return CollectState(
-            np.zeros((*shape, *self._spaces.observation_shape), dtype),
-            initial_moments((members,), size),
-            initial_moments((members,), 1),
-            np.zeros(shape),
-            np.zeros(shape),
-            np.zeros(shape, np.int64),
+        self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
+        self._chunks = chunk_sizes(self._config.rollout_steps)
+        self.observation_moments = self._observation_moments()
+        self.reward_moments = initial_moments((len(keys),), 1)
+        self.state = CollectState(
+            np.zeros(
+                (*self._shape, *spaces.observation_shape),
+                np.uint8 if spaces.observation_kind == "image" else np.float64,
+            ),
+            np.zeros(self._shape),
+            np.zeros(self._shape),
+            np.zeros(self._shape, np.int64),
         )
+
+    def _observation_moments(self) -> ObservationMoments | None:
+        if not self._config.normalize_observations or self._spaces.observation_kind != "vector":
+            return None
+        size = self._spaces.observation_shape[0]
+        return ObservationMoments(*self._shape, size, self._config.clip_observations)
 
     def _allocate(self) -> Any:
         members, number = self._shape
@@ -110,16 +118,13 @@ class HostCollector:
 
     def start(self) -> None:
         """Resets every environment; the first observations enter the running moments."""
-        observation = self._envs.reset().reshape(self.state.observation.shape)
-        self.state.observation[:] = observation
-        self._see(np.ones(self._shape, bool))
+        self.state.observation[:] = self._envs.reset().reshape(self.state.observation.shape)
+        if self.observation_moments is not None:
+            self.observation_moments.plan(np.ones(self._shape, bool), 1)
+            self.observation_moments.see(self.state.observation, 0)
 
     def collect(
-        self,
-        params: Array,
-        hypers: list[Hypers],
-        iteration: int,
-        limit: np.ndarray,
+        self, params: np.ndarray, hypers: list[Hypers], iteration: int, limit: np.ndarray
     ) -> list[Collected]:
         """One rollout of every member that may still act.
 
@@ -132,31 +137,41 @@ class HostCollector:
         Returns:
           a `Collected` per member (with an empty rollout for those left out).
         """
-        self._buffers.valid[:] = False
-        self._buffers.keep[:] = False
-        endings: list[list[_Ending]] = [[] for _ in self._keys]
+        buffers, members = self._buffers, range(len(self._keys))
+        for name in ("valid", "keep", "terminated", "truncated"):
+            getattr(buffers, name)[:] = False
+        self._actor.load(params)
+        self._show()
         filters = self._start_filters()
-        kept = np.zeros(self._shape, np.int64)
-        noise: np.ndarray | None = None
-        t = 0
-        while True:
-            wanted = np.minimum(self._config.rollout_steps - kept, limit[:, None] - t)
-            if self._config.dropped == "mask":
-                wanted = np.minimum(wanted, self._config.rollout_steps - t)
-            acting = wanted > 0
-            if not acting.any():
-                break
-            stretch = int(wanted[acting].min())
-            for row in range(t, t + stretch):
-                if row % self._config.rollout_steps == 0:
-                    noise = self._draw(iteration, row // self._config.rollout_steps)
-                assert noise is not None
-                self._step(params, noise[row % self._config.rollout_steps], row, acting, endings)
-            self._decide(filters, hypers, iteration, t, stretch, acting)
-            kept += self._buffers.keep[:, t : t + stretch].sum(1)
-            t += stretch
-        self._fill_next_values(params, endings, t)
-        return [self._collected(member, endings[member]) for member in range(len(self._keys))]
+        plans = [self._plan(member, 0, limit) for member in members]
+        noise, t, block = np.zeros(0), 0, self._config.rollout_steps
+        final_values: dict[tuple[int, int, int], float] = {}
+        while any(plan.last > t for plan in plans):
+            if t % block == 0:
+                noise = self._draw(iteration, t // block)
+            ends = [plan.last for plan in plans if plan.last > t]
+            until = min(*ends, t - t % block + block)
+            acting = np.stack([plan.acting for plan in plans])
+            buffers.valid[:, t:until] = acting[:, None]
+            self._act(params, noise[t % block :], t, until, acting, final_values)
+            t = until
+            for member in members:
+                if plans[member].last == t:
+                    first = plans[member].first
+                    self._score(params[member], member, first, t)
+                    self._decide(filters, hypers[member], iteration, member, first, t)
+                    plans[member] = self._plan(member, t, limit)
+        self._fill_next_values(params, final_values, t)
+        return [self._collected(member) for member in members]
+
+    def _plan(self, member: int, t: int, limit: np.ndarray) -> _Stretch:
+        """A member's next stretch, from row `t` on. It depends on nothing but the member."""
+        steps = self._config.rollout_steps
+        wanted = np.minimum(steps - self._buffers.keep[member].sum(0), limit[member] - t)
+        if self._config.dropped == "mask":
+            wanted = np.minimum(wanted, steps - t)
+        acting = wanted > 0
+        return _Stretch(t, t + int(wanted[acting].min()) if acting.any() else 0, acting)
 
     def _draw(self, iteration: int, block: int) -> np.ndarray:
         """Action noise of T steps `[T, P, N, M]`."""
@@ -168,6 +183,80 @@ class HostCollector:
             axis=1,
         )
 
+    def _act(
+        self,
+        params: np.ndarray,
+        noise: np.ndarray,
+        first: int,
+        last: int,
+        acting: np.ndarray,
+        final_values: dict[tuple[int, int, int], float],
+    ) -> None:
+        """Acts everywhere for rows `first` to `last` of the buffers."""
+        buffers, actor, seen = self._buffers, self._actor, self.state.observation
+        shape, active, width = self._shape, acting.reshape(-1), self._spaces.action_width
+        moments = self.observation_moments
+        if moments is not None:
+            moments.plan(acting, last - first)
+        for row in range(first, last):
+            buffers.observation[:, row] = actor.observation
+            action = actor.act(noise[row - first])
+            buffers.action[:, row] = action
+            step = self._envs.step(action.reshape(-1, width), active)
+            self._rewards[:, row] = step.reward.reshape(shape)
+            seen[:] = step.observation.reshape(seen.shape)
+            if moments is None:
+                actor.observation[:] = seen
+            else:
+                moments.see(seen, row - first)
+                moments.normalize(seen, actor.observation)
+            if step.ended:
+                self._note_ends(params, step, row, acting, final_values)
+
+    def _show(self) -> None:
+        """Puts the current observations before the actor, normalised."""
+        if self.observation_moments is None:
+            self._actor.observation[:] = self.state.observation
+        else:
+            self.observation_moments.normalize(self.state.observation, self._actor.observation)
+
+    def _note_ends(
+        self,
+        params: np.ndarray,
+        step: Step,
+        row: int,
+        acting: np.ndarray,
+        final_values: dict[tuple[int, int, int], float],
+    ) -> None:
+        """Writes which episodes ended; the value of what a truncated one had reached is kept."""
+        terminated = step.terminated.reshape(self._shape) & acting
+        truncated = step.truncated.reshape(self._shape) & acting
+        self._buffers.terminated[:, row] = terminated
+        self._buffers.truncated[:, row] = truncated
+        if self._config.truncation == "bootstrap" and truncated.any():
+            final = step.final_observation.reshape(self.state.observation.shape)
+            for member, env in np.argwhere(truncated).tolist():
+                value = self._values(params, final, member)[env]
+                final_values[member, row, env] = float(value)
+
+    def _values(self, params: np.ndarray, raw: np.ndarray, member: int) -> np.ndarray:
+        """V of a member's N raw observations, `raw` being `[P, N, *obs]`."""
+        observation = raw[member]
+        if self.observation_moments is not None:
+            moments = self.observation_moments.of(member)
+            observation = normalize(moments, observation, self._config.clip_observations)
+        observation = observation.astype(self._spaces.observation_dtype)
+        return np.asarray(self._program.value(params[member], observation))
+
+    def _score(self, params: np.ndarray, member: int, first: int, last: int) -> None:
+        """Writes log-probability, value and Vex for the rows of a member's stretch."""
+        buffers, rows = self._buffers, slice(first, last)
+        observation = self._padded(buffers.observation[member, rows])
+        action = self._padded(buffers.action[member, rows])
+        scores = np.asarray(self._program.score(params, observation, action))[: last - first]
+        for i, name in enumerate(("log_prob", "value", "vex")):
+            getattr(buffers, name)[member, rows] = scores[..., i]
+
     def _start_filters(self) -> list[Any]:
         filter = self._program.filter
         if filter is None:
@@ -175,134 +264,37 @@ class HostCollector:
         return [filter.init(self._config.envs, self._capacity) for _ in self._keys]
 
     def _decide(
-        self,
-        filters: list[Any],
-        hypers: list[Hypers],
-        iteration: int,
-        first: int,
-        length: int,
-        acting: np.ndarray,
+        self, filters: list[Any], hypers: Hypers, iteration: int, member: int, first: int, last: int
     ) -> None:
-        """Writes `keep` for the rows of a stretch."""
-        buffers, rows = self._buffers, slice(first, first + length)
+        """Writes `keep` for the rows of a member's stretch."""
+        buffers, rows = self._buffers, slice(first, last)
+        valid = buffers.valid[member, rows]
         if not filters:
-            buffers.keep[:, rows] = buffers.valid[:, rows]
+            buffers.keep[member, rows] = valid
             return
-        for member in np.flatnonzero(acting.any(1)):
-            filters[member], mask = self._program.decide(
-                filters[member],
-                self._padded(buffers.observation[member, rows]),
-                self._padded(buffers.vex[member, rows]),
-                np.int32(first),
-                np.int32(length),
-                jax.random.fold_in(self._keys[member].filter, iteration),
-                hypers[member],
-            )
-            buffers.keep[member, rows] = np.asarray(mask)[:length] & acting[member]
+        filters[member], mask = self._program.decide(
+            filters[member],
+            self._padded(buffers.observation[member, rows]),
+            self._padded(buffers.vex[member, rows]),
+            np.int32(first),
+            np.int32(last - first),
+            jax.random.fold_in(self._keys[member].filter, iteration),
+            hypers,
+        )
+        buffers.keep[member, rows] = np.asarray(mask)[: last - first] & valid
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
-        """`[length, ...]` -> `[T, ...]`, so that stretches of every length share one program."""
-        padded = np.zeros((self._config.rollout_steps, *rows.shape[1:]), rows.dtype)
-        padded[: rows.shape[0]] = rows
+        """`[length, ...]` -> `[chunk, ...]`: stretches of all lengths share a few programs."""
+        size = next(size for size in self._chunks if size >= len(rows))
+        if size == len(rows):
+            return rows
+        padded = np.zeros((size, *rows.shape[1:]), rows.dtype)
+        padded[: len(rows)] = rows
         return padded
 
-    def _step(
-        self,
-        params: Array,
-        noise: np.ndarray,
-        row: int,
-        acting: np.ndarray,
-        endings: list[list[_Ending]],
+    def _fill_next_values(
+        self, params: np.ndarray, final_values: dict[tuple[int, int, int], float], rows: int
     ) -> None:
-        """Acts once everywhere and writes row `row` of the buffers."""
-        state, buffers, width = self.state, self._buffers, self._spaces.action_width
-        observation = self._policy_observation()
-        packed = np.asarray(self._program.act(params, observation, noise))
-        action = packed[..., :width].astype(self._spaces.action_dtype)
-        step = self._envs.step(action.reshape(-1, width), acting.reshape(-1))
-        buffers.observation[:, row] = observation
-        buffers.action[:, row] = action
-        buffers.log_prob[:, row] = packed[..., width]
-        buffers.value[:, row] = packed[..., width + 1]
-        buffers.vex[:, row] = packed[..., width + 2]
-        buffers.valid[:, row] = acting
-        reward = np.where(acting, step.reward.reshape(self._shape), 0.0)
-        terminated = step.terminated.reshape(self._shape) & acting
-        truncated = step.truncated.reshape(self._shape) & acting
-        buffers.terminated[:, row] = terminated
-        buffers.truncated[:, row] = truncated
-        state.observation[:] = step.observation.reshape(state.observation.shape)
-        state.episode_return[:] += reward
-        state.episode_length[:] += acting
-        self._see(acting)
-        buffers.reward[:, row] = self._scaled_reward(reward, acting)
-        ended = terminated | truncated
-        if ended.any():
-            self._end_episodes(params, step, row, ended, truncated, endings)
-
-    def _policy_observation(self) -> np.ndarray:
-        raw = self.state.observation
-        if not self._normalizes:
-            return raw if raw.dtype == np.uint8 else raw.astype(np.float32)
-        clip = self._config.clip_observations
-        return normalize(self.state.observation_moments, raw, clip).astype(np.float32)
-
-    def _see(self, acting: np.ndarray) -> None:
-        """The observations just received enter the running moments."""
-        if self._normalizes:
-            moments = update_moments(self.state.observation_moments, self.state.observation, acting)
-            self.state = self.state._replace(observation_moments=moments)
-
-    def _scaled_reward(self, reward: np.ndarray, acting: np.ndarray) -> np.ndarray:
-        """Rewards over the running std of the discounted return, as VecNormalize has it."""
-        if not self._config.normalize_rewards:
-            return reward
-        discounted = self.state.discounted_return
-        discounted[:] = np.where(acting, discounted * self._config.gamma + reward, discounted)
-        moments = update_moments(self.state.reward_moments, discounted[..., None], acting)
-        self.state = self.state._replace(reward_moments=moments)
-        return scale(moments, reward, self._config.clip_rewards)
-
-    def _end_episodes(
-        self,
-        params: Array,
-        step: Step,
-        row: int,
-        ended: np.ndarray,
-        truncated: np.ndarray,
-        endings: list[list[_Ending]],
-    ) -> None:
-        state = self.state
-        final = step.final_observation.reshape(state.observation.shape)
-        for member, env in zip(*np.nonzero(ended), strict=True):
-            final_value = 0.0
-            if truncated[member, env] and self._config.truncation == "bootstrap":
-                final_value = self._values(params, final, int(member))[env]
-            endings[member].append(
-                _Ending(
-                    row,
-                    int(env),
-                    float(state.episode_return[member, env]),
-                    int(state.episode_length[member, env]),
-                    bool(truncated[member, env]),
-                    float(final_value),
-                )
-            )
-        state.discounted_return[ended] = 0.0
-        state.episode_return[ended] = 0.0
-        state.episode_length[ended] = 0
-
-    def _values(self, params: Array, raw: np.ndarray, member: int) -> np.ndarray:
-        """V of a member's N raw observations, `raw` being `[P, N, *obs]`."""
-        observation = raw[member]
-        if self._normalizes:
-            moments = Moments(*(part[member] for part in self.state.observation_moments))
-            observation = normalize(moments, observation, self._config.clip_observations)
-        if observation.dtype != np.uint8:
-            observation = observation.astype(np.float32)
-        return np.asarray(self._program.value(params[member], observation))
-
-    def _fill_next_values(self, params: Array, endings: list[list[_Ending]], rows: int) -> None:
         """The value of each step's true successor, once all values are known."""
         buffers = self._buffers
         buffers.next_value[:, : rows - 1] = buffers.value[:, 1:rows]
@@ -311,16 +303,65 @@ class HostCollector:
             last = steps[member] - 1
             after = self._values(params, self.state.observation, int(member))
             buffers.next_value[member, last, np.arange(len(last))] = after
-            for ending in endings[member]:
-                buffers.next_value[member, ending.row, ending.env] = ending.final_value
+        ended = buffers.terminated | buffers.truncated
+        buffers.next_value[ended] = 0.0
+        for place, value in final_values.items():
+            buffers.next_value[place] = value
 
-    def _collected(self, member: int, endings: list[_Ending]) -> Collected:
+    def _collected(self, member: int) -> Collected:
+        episodes = self._finish(member)
         rollout = Rollout(*(buffer[member] for buffer in self._buffers))
-        episodes = [
-            Episode(e.env, e.return_, e.length, e.truncated, bool(rollout.keep[e.row, e.env]))
-            for e in endings
-        ]
         return Collected(rollout, int(rollout.valid.sum()), int(rollout.keep.sum()), episodes)
+
+    def _finish(self, member: int) -> list[Episode]:
+        """Scales a member's rewards; its episodes, in the order in which they ended."""
+        buffers, state = self._buffers, self.state
+        used = int(buffers.valid[member].any(1).sum())
+        valid = buffers.valid[member, :used]
+        reward = np.where(valid, self._rewards[member, :used], 0.0)
+        ended = (buffers.terminated | buffers.truncated)[member, :used]
+        buffers.reward[member, :used] = self._scaled(member, reward, ended, valid)
+        returns, lengths = state.episode_return[member], state.episode_length[member]
+        starts, episodes = [0] * len(returns), []
+        for row, env in np.argwhere(ended).tolist():
+            episodes.append(
+                Episode(
+                    env,
+                    running_sum(returns[env], reward[starts[env] : row + 1, env]),
+                    int(lengths[env]) + row + 1 - starts[env],
+                    bool(buffers.truncated[member, row, env]),
+                    bool(buffers.keep[member, row, env]),
+                )
+            )
+            returns[env], lengths[env], starts[env] = 0.0, 0, row + 1
+        for env, start in enumerate(starts):
+            returns[env] = running_sum(returns[env], reward[start:, env])
+            lengths[env] += max(int(valid[:, env].sum()) - start, 0)
+        return episodes
+
+    def _scaled(
+        self, member: int, reward: np.ndarray, ended: np.ndarray, valid: np.ndarray
+    ) -> np.ndarray:
+        """Rewards `[S, N]` over the running std of the discounted return, as in VecNormalize."""
+        if not self._config.normalize_rewards or not len(reward):
+            return reward
+        own = Moments(*(float(part[member, 0]) for part in self.reward_moments))
+        sums, last = discounted_returns(
+            reward, ended, valid, self.state.discounted_return[member], self._config.gamma
+        )
+        self.state.discounted_return[member] = last
+        after = moments_after_each(own, sums, valid)
+        for part, value in zip(self.reward_moments, after, strict=True):
+            part[member, 0] = value[-1]
+        return scale_rewards(after, reward, self._config.clip_rewards)
+
+
+def running_sum(start: float, values: np.ndarray) -> float:
+    """`start + values[0] + values[1] + ...`, in this order, wherever the sum is interrupted."""
+    total = float(start)
+    for value in values.tolist():
+        total += value
+    return total
 
 
 def capacity(config: Config) -> int:
@@ -328,3 +369,11 @@ def capacity(config: Config) -> int:
     if config.filter == "none" or config.dropped == "mask":
         return config.rollout_steps
     return config.rollout_steps * config.max_env_steps_factor
+
+
+def chunk_sizes(rollout_steps: int) -> list[int]:
+    """Lengths that stretches are padded to, rising: T, and T over powers of 4 down to 32."""
+    sizes = [rollout_steps]
+    while sizes[0] >= 128:
+        sizes.insert(0, -(-sizes[0] // 4))
+    return sizes

@@ -50,17 +50,12 @@ def update_moments(moments: Moments, batch: Any, active: Any) -> Moments:
     total = moments.count + number
     fraction = number / total
     delta = batch_mean - moments.mean
-    mean = moments.mean + delta * fraction
-    variance = (moments.variance + delta**2 * fraction) * (moments.count / total)
-    return Moments(mean, variance + batch_variance * fraction, total)
+    move = delta * fraction
+    variance = (moments.variance + delta * move) * (moments.count / total)
+    return Moments(moments.mean + move, variance + batch_variance * fraction, total)
 
 
 def normalize(moments: Moments, batch: Any, clip: float) -> Any:
     """`clip((x - mean) / sqrt(var + eps), +-clip)` of `[..., N, D]`."""
     mean, variance = moments.mean[..., None, :], moments.variance[..., None, :]
     return ((batch - mean) / (variance + EPSILON) ** 0.5).clip(-clip, clip)
-
-
-def scale(moments: Moments, reward: Any, clip: float) -> Any:
-    """`clip(r / sqrt(var + eps), +-clip)` of `[..., N]`, moments of one number (`D` = 1)."""
-    return (reward / (moments.variance + EPSILON) ** 0.5).clip(-clip, clip)

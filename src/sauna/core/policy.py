@@ -67,12 +67,15 @@ def _named(module: Callable[..., nn.Module], name: str, **settings: Any) -> nn.M
 
 
 def _unraveler(example: Params) -> Callable[[Array], Params]:
-    """The inverse of `ravel_pytree` for trees like `example`; it keeps the vector's precision."""
+    """The inverse of `ravel_pytree` for trees like `example`, of numpy or JAX vectors.
+
+    It keeps the vector's precision.
+    """
     leaves, structure = jax.tree_util.tree_flatten(example)
     ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
 
     def unravel(vector: Array) -> Params:
-        parts = jnp.split(vector, ends)
+        parts = (np if isinstance(vector, np.ndarray) else jnp).split(vector, ends)
         shaped = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
         return jax.tree_util.tree_unflatten(structure, shaped)
 
@@ -101,17 +104,20 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
 
 
 def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Array:
-    """Acts once in the N envs of a member.
+    """Actions `[N, A]` in the N envs of a member.
 
     Args:
       observation: `[N, *obs]` normalised; noise: `[N, M]` from `distribution.draw`.
+    """
+    return policy.distribution.sample(policy.apply(params, observation).policy, noise)
 
-    Returns:
-      `[N, A + 3]` float32: action, log_prob, value, vex side by side, so that the host fetches one
-      array. Integer actions below 2^24 are exact in it.
+
+def score(policy: Policy, params: Array, observation: Array, action: Array) -> Array:
+    """`[L, N, 3]`: log-probability of the action taken, value and Vex, side by side.
+
+    Args:
+      observation: `[L, N, *obs]` normalised; action: `[L, N, A]`.
     """
     output = policy.apply(params, observation)
-    action = policy.distribution.sample(output.policy, noise)
     log_prob = policy.distribution.log_prob(output.policy, action)
-    columns = [log_prob[:, None], output.value[:, None], output.vex[:, None]]
-    return jnp.concatenate([action.astype(jnp.float32), *columns], -1)
+    return jnp.stack([log_prob, output.value, output.vex], -1)

@@ -10,7 +10,7 @@ import jax
 
 from sauna.config import Config
 from sauna.core.batch import make_batch
-from sauna.core.policy import Policy, act, make_policy
+from sauna.core.policy import Policy, act, make_policy, score
 from sauna.core.types import Array, Batch, Hypers, Rollout, TrainState
 from sauna.core.update import UpdateMetrics, init_state, learn
 from sauna.selection.filters import Filter, decide, make_filter
@@ -32,7 +32,8 @@ class Program(NamedTuple):
     init: Callable[[Array], TrainState]
     draw: Callable[[Array, Any, Any], Array]
     act: Callable[[Array, Any, Any], Array]
-    value: Callable[[Array, Any], Array]
+    score: Callable[[Any, Any, Any], Array]
+    value: Callable[[Any, Any], Array]
     decide: Callable[..., tuple[Any, Array]]
     make_batch: Callable[[Rollout, Hypers], Batch]
     learn: Callable[[TrainState, Rollout, Batch, Hypers, Array], tuple[TrainState, UpdateMetrics]]
@@ -64,6 +65,7 @@ def make_program(config: Config, spaces: Spaces) -> Program:
         init=jax.jit(partial(init_state, policy)),
         draw=jax.jit(draw),
         act=jax.jit(map_members(partial(act, policy))),
+        score=jax.jit(partial(score, policy)),
         value=jax.jit(lambda params, observation: policy.apply(params, observation).value),
         decide=jax.jit(partial(decide, filter)) if filter else _nothing_to_decide,
         make_batch=jax.jit(partial(make_batch, config=config, target=target)),

@@ -14,13 +14,17 @@ Snapshot = dict[str, np.ndarray]
 
 
 class Step(NamedTuple):
-    """One env step of M environments. Rows of environments that were not active are meaningless."""
+    """One env step of M environments. Rows of environments that were not active are meaningless.
+
+    The arrays may be reused by the next step.
+    """
 
     observation: np.ndarray  # [M, *obs] what the policy sees next
     reward: np.ndarray  # [M] float64
     terminated: np.ndarray  # [M] bool
     truncated: np.ndarray  # [M] bool, never together with terminated
     final_observation: np.ndarray  # [M, *obs], meaningful where an episode ended
+    ended: bool  # whether any episode ended: what most steps have to look at
 
 
 class HostEnvs(Protocol):

@@ -74,7 +74,7 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
         raise BadInput(f"env: {env} cannot be made: {one_line(error)}") from error
 
 
-class _Slot:
+class Slot:
     """One environment, its running episode, and the actions taken in it."""
 
     __slots__ = ("actions", "env", "episode", "name", "seeds")
@@ -94,7 +94,7 @@ class GymnasiumEnvs(HostEnvs):
     """
 
     def __init__(self, make: Callable[[], Any], seeds: Sequence[tuple[int, int]]) -> None:
-        self._slots = [_Slot(make(), pair) for pair in seeds]
+        self._slots = [Slot(make(), pair) for pair in seeds]
         env = self._slots[0].env
         self.spaces = describe(env.observation_space, env.action_space)
         self._read = observation_reader(env.observation_space)
@@ -115,7 +115,7 @@ class GymnasiumEnvs(HostEnvs):
         self._check_finite(np.ones(len(self._slots), bool))
         return self._observation.copy()
 
-    def _start_episode(self, index: int, slot: _Slot) -> None:
+    def _start_episode(self, index: int, slot: Slot) -> None:
         slot.episode += 1
         slot.actions = []
         try:
@@ -127,12 +127,19 @@ class GymnasiumEnvs(HostEnvs):
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
         self._terminated[:] = False
         self._truncated[:] = False
+        ended = False
         for index in np.flatnonzero(active):
-            self._step_one(int(index), self._slots[index], action[index])
+            ended |= self._step_one(int(index), self._slots[index], action[index])
         self._check_finite(active)
-        return Step(self._observation, self._reward, self._terminated, self._truncated, self._final)
+        return self._told(ended)
 
-    def _step_one(self, index: int, slot: _Slot, action: np.ndarray) -> None:
+    def _told(self, ended: bool) -> Step:
+        return Step(
+            self._observation, self._reward, self._terminated, self._truncated, self._final, ended
+        )
+
+    def _step_one(self, index: int, slot: Slot, action: np.ndarray) -> bool:
+        """Steps one environment; whether its episode ended."""
         slot.actions.append(action)
         try:
             observation, reward, terminated, truncated, _ = slot.env.step(self._write(action))
@@ -146,8 +153,9 @@ class GymnasiumEnvs(HostEnvs):
             self._final_sum = self._final.sum()
             self._check_finite(np.arange(len(self._slots)) == index)
             self._start_episode(index, slot)
-        else:
-            self._observation[index] = self._read(observation)
+            return True
+        self._observation[index] = self._read(observation)
+        return False
 
     def _check_finite(self, active: np.ndarray) -> None:
         """One sum tells whether anything is amiss; only then the culprit is looked for."""

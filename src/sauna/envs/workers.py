@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from sauna.envs.backend import in_process_envs
 from sauna.envs.contract import HostEnvs, Snapshot, Step
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
+from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
 from sauna.errors import SaunaError
 from sauna.spaces import read_spaces
 from sauna.wire import Message, child_ends, receive, send, start_worker
+
+ARRAYS = [name for name in Step._fields if name != "ended"]
 
 
 class ProcessEnvs(HostEnvs):
@@ -23,6 +26,7 @@ class ProcessEnvs(HostEnvs):
       seeds: `(member seed, env index)` of each environment.
       processes: number of workers.
       timeout: seconds after which a silent worker counts as hung.
+      backend: of each worker; see `in_process_envs`.
     """
 
     def __init__(
@@ -32,6 +36,7 @@ class ProcessEnvs(HostEnvs):
         seeds: Sequence[tuple[int, int]],
         processes: int,
         timeout: float,
+        backend: str = "auto",
     ) -> None:
         self._timeout = timeout
         self._parts = np.array_split(np.arange(len(seeds)), processes)
@@ -40,7 +45,8 @@ class ProcessEnvs(HostEnvs):
         for worker, part in zip(self._workers, self._parts, strict=True):
             chosen = [list(seeds[i]) for i in part]
             try:
-                worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen})
+                worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen,
+                            "backend": backend})  # fmt: skip
             except BrokenPipeError:
                 pass  # named when its answer is read
         answers = [self._answer(number) for number in range(processes)]
@@ -58,7 +64,8 @@ class ProcessEnvs(HostEnvs):
             arrays = {"action": action[part], "active": active[part]}
             self._say(number, {"kind": "step"}, arrays)
         answers = [self._answer(number).arrays for number in range(len(self._workers))]
-        return Step(*(np.concatenate([a[name] for a in answers]) for name in Step._fields))
+        parts = {name: np.concatenate([a[name] for a in answers]) for name in ARRAYS}
+        return Step(**parts, ended=bool(parts["terminated"].any() or parts["truncated"].any()))
 
     def snapshot(self, index: int) -> Snapshot:
         number, local = self._find(index)
@@ -112,7 +119,8 @@ def _serve(envs: GymnasiumEnvs, message: Message) -> dict[str, np.ndarray]:
     if kind == "reset":
         return {"observation": envs.reset()}
     if kind == "step":
-        return envs.step(arrays["action"], arrays["active"])._asdict()
+        step = envs.step(arrays["action"], arrays["active"])
+        return {name: getattr(step, name) for name in ARRAYS}
     if kind == "snapshot":
         return envs.snapshot(message.header["index"])
     go_on = envs.restore if kind == "restore" else envs.start_after
@@ -124,8 +132,8 @@ def main() -> None:
     inbox, outbox = child_ends(sys.argv[1:])
     try:
         header = receive(inbox).header
-        make = env_maker(header["env"], header["kwargs"])
-        envs = GymnasiumEnvs(make, [(int(a), int(b)) for a, b in header["seeds"]])
+        seeds = [(int(a), int(b)) for a, b in header["seeds"]]
+        envs = in_process_envs(header["env"], header["kwargs"], seeds, header["backend"])
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
         while True:
             send(outbox, {"kind": "answer"}, _serve(envs, receive(inbox)))

@@ -1,0 +1,115 @@
+"""The MuJoCo fast path against Gymnasium's own environments, bit for bit."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from sauna.envs.backend import in_process_envs
+from sauna.envs.contract import episode_seed
+from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.mujoco import TASKS, MujocoEnvs
+
+SEEDS = [(3, 0), (3, 1), (7, 0)]
+NAMES = sorted(
+    name
+    for name, spec in gymnasium.registry.items()
+    if str(spec.entry_point).startswith("gymnasium.envs.mujoco") and name.endswith("-v5")
+)
+KWARGS = [
+    ("Hopper-v5", {"terminate_when_unhealthy": False, "forward_reward_weight": 2.5}),
+    ("Walker2d-v5", {"exclude_current_positions_from_observation": False, "frame_skip": 3}),
+    ("HalfCheetah-v5", {"ctrl_cost_weight": 0.7, "reset_noise_scale": 0.5}),
+    ("Hopper-v5", {"healthy_state_range": [-1.0, 1.0], "healthy_angle_range": [-2.0, 2.0]}),
+    ("Reacher-v5", {"reward_dist_weight": 3}),
+]
+
+
+def wide_actions(env: MujocoEnvs | GymnasiumEnvs, steps: int, seed: int) -> np.ndarray:
+    """Actions of which many lie outside the bounds."""
+    width = env.spaces.action_width
+    shape = (steps, len(SEEDS), width)
+    return np.random.default_rng(seed).normal(0, 0.7, shape).astype(np.float32)
+
+
+def test_these_are_the_eleven_tasks() -> None:
+    assert len(NAMES) == len(TASKS) == 11
+
+
+@pytest.mark.parametrize("name, kwargs", [(name, {}) for name in NAMES] + KWARGS)
+def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
+    """Every task to its time limit, or through tens of falls; some rows stand still for a while."""
+    fast = in_process_envs(name, kwargs, SEEDS, "auto")
+    plain = in_process_envs(name, kwargs, SEEDS, "gymnasium")
+    assert type(fast) is MujocoEnvs and type(plain) is GymnasiumEnvs
+    np.testing.assert_array_equal(fast.reset(), plain.reset())
+    ends = 0
+    for t, action in enumerate(wide_actions(fast, 1030, seed=1)):
+        active = np.array([True, t % 50 != 7, not 200 < t < 205])
+        one, two = fast.step(action, active), plain.step(action, active)
+        ended = active & (two.terminated | two.truncated)
+        assert one.ended == two.ended == ended.any()
+        for a, b in zip(one[:4], two[:4], strict=True):
+            assert a[active].tobytes() == b[active].tobytes(), f"step {t}"
+        np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])
+        ends += ended.sum()
+    assert ends >= 3 if kwargs == {} else ends >= 1
+    fast.close(), plain.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_restored_environment_goes_on_bit_for_bit(name: str) -> None:
+    envs, again = (in_process_envs(name, {}, SEEDS, "auto") for _ in range(2))
+    actions = wide_actions(envs, 60, seed=2)
+    every = np.ones(len(SEEDS), bool)
+    envs.reset(), again.reset()
+    for action in actions[:41]:
+        step = envs.step(action, every)
+    for i in range(len(SEEDS)):
+        seen = again.restore(i, {k: v.copy() for k, v in envs.snapshot(i).items()})
+        np.testing.assert_array_equal(seen, step.observation[i])
+    for action in actions[41:]:
+        one, two = envs.step(action, every), again.step(action, every)
+        for a, b in zip(one[:4], two[:4], strict=True):
+            assert a.tobytes() == b.tobytes()
+    envs.close(), again.close()
+
+
+def test_what_the_fast_path_does_not_know_is_left_to_gymnasium() -> None:
+    """A wrapper, a subclass or an older version may do something in `step` that would be lost."""
+    for name, kwargs in [("Hopper-v4", {}), ("CartPole-v1", {}), ("worlds:Scripted", {})]:
+        if name in gymnasium.registry or ":" in name:
+            envs = in_process_envs(name, kwargs, SEEDS, "auto")
+            assert type(envs) is GymnasiumEnvs
+            envs.close()
+    gymnasium.register(
+        "WrappedHopper-v0",
+        "gymnasium.envs.mujoco.hopper_v5:HopperEnv",
+        max_episode_steps=1000,
+        additional_wrappers=(gymnasium.wrappers.ClipReward.wrapper_spec(min_reward=-1),),
+    )
+    try:
+        assert type(in_process_envs("WrappedHopper-v0", {}, SEEDS, "auto")) is GymnasiumEnvs
+    finally:
+        del gymnasium.registry["WrappedHopper-v0"]
+
+
+def test_non_finite_states_are_named(monkeypatch) -> None:
+    """MuJoCo resets a state that explodes by itself; here it is kept from doing so."""
+    envs = in_process_envs("HalfCheetah-v5", {}, SEEDS, "auto")
+    envs.reset()
+    envs._slots[1].env.unwrapped.data.qvel[4] = np.nan
+    monkeypatch.setattr("sauna.envs.mujoco.mujoco.mj_step", lambda *arguments: None)
+    with pytest.raises(
+        EnvironmentFailure, match="1 of seed 3, episode 0, step 1: observation.12. is"
+    ):
+        envs.step(np.zeros((3, 6), np.float32), np.ones(3, bool))
+    envs.close()
+
+
+def test_the_seed_of_an_episode_is_the_contracts() -> None:
+    envs = in_process_envs("Swimmer-v5", {}, SEEDS, "auto")
+    expected, _ = gymnasium.make("Swimmer-v5").reset(seed=episode_seed(3, 1, 0))
+    np.testing.assert_array_equal(envs.reset()[1], expected)
+    envs.close()
