@@ -11,6 +11,7 @@ import pytest
 from helpers import configured
 from sauna.core.losses import combine, standardize, surrogate, value_error
 from sauna.core.policy import make_policy
+from sauna.core.population import minibatch_order
 from sauna.core.types import Batch, Hypers
 from sauna.core.update import init_state, minibatch_losses, update
 from sauna.selection.vex import TARGETS
@@ -150,10 +151,10 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
         policy = make_policy(config, VECTOR)
         target = TARGETS["sample"]
         batch = jax.tree.map(jnp.asarray, random_batch())
-        key = jax.random.key(7)
+        order = minibatch_order(config, seed=7, iteration=2)
         state = init_state(policy, jax.random.key(0))
         state = jax.tree.map(lambda x: x.astype(jnp.float64) if x.dtype == np.float32 else x, state)
-        got, _, norm = update(state, batch, h, key, config=config, policy=policy, target=target)
+        got, _, norm = update(state, batch, h, order, config=config, policy=policy, target=target)
 
         def loss(p, part):
             return minibatch_losses(p, part, h, config=config, policy=policy, target=target).total
@@ -161,10 +162,9 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
         params = np.asarray(state.params)
         mean, square, norms = np.zeros_like(params), np.zeros_like(params), []
         count = 0
-        for epoch_key in jax.random.split(key, 3):
-            order = np.asarray(jax.random.permutation(epoch_key, 24))
-            assert sorted(order) == list(range(24))
-            for rows in order.reshape(2, 12):
+        for epoch in order:
+            assert sorted(epoch) == list(range(24))
+            for rows in epoch.reshape(2, 12):
                 part = jax.tree.map(lambda x, rows=rows: x[rows], batch)
                 g = np.asarray(jax.grad(loss)(jnp.asarray(params), part))
                 norms.append(np.sqrt((g**2).sum()))
@@ -178,3 +178,11 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
     np.testing.assert_allclose(norm, np.mean(norms), rtol=1e-9)
     assert min(norms) > 0.05  # the clipping was active, and global rather than per element
     assert isinstance(got.optimizer, optax.ScaleByAdamState)
+
+
+def test_the_order_of_samples_depends_on_seed_iteration_and_epoch() -> None:
+    config = configured(epochs=3, minibatches=2, rollout_steps=24, steps=24)
+    orders = [minibatch_order(config, seed, i) for seed in (0, 1) for i in (0, 1)]
+    rows = {tuple(row) for order in orders for row in order.tolist()}
+    assert len(rows) == 12
+    np.testing.assert_array_equal(orders[3], minibatch_order(config, 1, 1))

@@ -16,7 +16,7 @@ import numpy as np
 
 from sauna.collect.host import Collected, HostCollector, capacity
 from sauna.config import Config
-from sauna.core.population import Keys, Program, make_program, member_keys
+from sauna.core.population import Keys, Program, make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers, TrainState
 from sauna.core.update import UpdateMetrics
 from sauna.envs.backend import in_process_envs
@@ -89,9 +89,8 @@ def train_members(job: Job, reporter: Reporter) -> None:
             collect_seconds = time.perf_counter() - clock
             rows = []
             for p in np.flatnonzero(limit):
-                states[p], learned = _learn(
-                    program, states[p], collected[p], hypers[p], keys[p], iteration
-                )
+                order = minibatch_order(config, members[p].seed, iteration)
+                states[p], learned = _learn(program, states[p], collected[p], hypers[p], order)
                 _check_finite(members[p], iteration, learned)
                 counters[p].add(collected[p])
                 rows.append(
@@ -175,12 +174,10 @@ def _learn(
     state: TrainState,
     collected: Collected,
     hypers: Hypers,
-    keys: Keys,
-    iteration: int,
+    order: np.ndarray,
 ) -> tuple[TrainState, UpdateMetrics]:
     batch = program.make_batch(collected.rollout, hypers)
-    key = jax.random.fold_in(keys.minibatch, iteration)
-    state, metrics = program.learn(state, collected.rollout, batch, hypers, key)
+    state, metrics = program.learn(state, collected.rollout, batch, hypers, order)
     return state, jax.device_get(metrics)
 
 

@@ -10,6 +10,7 @@ actions do not depend on its neighbours.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,8 +30,11 @@ class Actor(Protocol):
     def load(self, params: np.ndarray) -> None:
         """Takes over the parameters `[P, D]` of the coming rollout."""
 
+    def prepare(self, noise: np.ndarray) -> np.ndarray:
+        """Many steps' noise of the distribution, `[T, P, N, M]`, in the form that `act` takes."""
+
     def act(self, noise: np.ndarray) -> np.ndarray:
-        """Actions `[P, N, A]`, a new array, from noise `[P, N, M]` of the distribution."""
+        """Actions `[P, N, A]`, a new array, with one step's prepared noise `[P, N, M]`."""
 
 
 class CompiledActor:
@@ -47,6 +51,9 @@ class CompiledActor:
 
         self._params = jnp.asarray(params)
 
+    def prepare(self, noise: np.ndarray) -> np.ndarray:
+        return noise
+
     def act(self, noise: np.ndarray) -> np.ndarray:
         return np.asarray(self._act(self._params, self.observation, noise))
 
@@ -58,7 +65,7 @@ class MLPActor:
     """
 
     def __init__(self, config: Config, spaces: Spaces, policy: Policy, members: int) -> None:
-        self._policy, self._spaces = policy, spaces
+        self._policy, self._sample = policy, _sampler(spaces)
         self._trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
         self._activate: Any = np.tanh if config.activation == "tanh" else _relu
         widths = [spaces.observation_shape[0], *config.hidden]
@@ -85,19 +92,25 @@ class MLPActor:
             if "log_std" in tree:
                 self._scale[p] = np.exp(tree["log_std"])
 
+    def prepare(self, noise: np.ndarray) -> np.ndarray:
+        return noise * self._scale
+
     def act(self, noise: np.ndarray) -> np.ndarray:
         inputs, weights, sums = self._inputs, self._weights, self._sums
         for i, hidden in enumerate(self._hidden):
             np.matmul(inputs[i], weights[i], out=sums[i])
             self._activate(sums[i], out=hidden)
         np.matmul(inputs[-1], weights[-1], out=sums[-1])
-        kind = self._spaces.action_kind
-        if kind == "continuous":
-            return sums[-1] + noise * self._scale
-        noisy = sums[-1] + noise
-        if kind == "multi_binary":
-            return (noisy > 0).astype(np.int32)
-        return _largest(noisy, self._spaces.action_sizes)
+        return self._sample(sums[-1] + noise)
+
+
+def _sampler(spaces: Spaces) -> Callable[[np.ndarray], np.ndarray]:
+    """From the policy head's outputs plus noise to actions, as `core.distributions` has it."""
+    if spaces.action_kind == "continuous":
+        return lambda noisy: noisy
+    if spaces.action_kind == "multi_binary":
+        return lambda noisy: (noisy > 0).astype(np.int32)
+    return lambda noisy: _largest(noisy, spaces.action_sizes)
 
 
 def _relu(x: np.ndarray, out: np.ndarray) -> None:

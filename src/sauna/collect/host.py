@@ -148,7 +148,7 @@ class HostCollector:
         final_values: dict[tuple[int, int, int], float] = {}
         while any(plan.last > t for plan in plans):
             if t % block == 0:
-                noise = self._draw(iteration, t // block)
+                noise = self._actor.prepare(self._draw(iteration, t // block))
             ends = [plan.last for plan in plans if plan.last > t]
             until = min(*ends, t - t % block + block)
             acting = np.stack([plan.acting for plan in plans])
@@ -193,18 +193,20 @@ class HostCollector:
         final_values: dict[tuple[int, int, int], float],
     ) -> None:
         """Acts everywhere for rows `first` to `last` of the buffers."""
-        buffers, actor, seen = self._buffers, self._actor, self.state.observation
+        actor, moments, seen = self._actor, self.observation_moments, self.state.observation
         shape, active, width = self._shape, acting.reshape(-1), self._spaces.action_width
-        moments = self.observation_moments
+        observations, actions, rewards = (
+            buffer.swapaxes(0, 1)  # rows first
+            for buffer in (self._buffers.observation, self._buffers.action, self._rewards)
+        )
         if moments is not None:
             moments.plan(acting, last - first)
         for row in range(first, last):
-            buffers.observation[:, row] = actor.observation
-            action = actor.act(noise[row - first])
-            buffers.action[:, row] = action
+            observations[row] = actor.observation
+            actions[row] = action = actor.act(noise[row - first])
             step = self._envs.step(action.reshape(-1, width), active)
-            self._rewards[:, row] = step.reward.reshape(shape)
-            seen[:] = step.observation.reshape(seen.shape)
+            rewards[row] = step.reward.reshape(shape)
+            seen = step.observation.reshape(seen.shape)
             if moments is None:
                 actor.observation[:] = seen
             else:
@@ -212,6 +214,7 @@ class HostCollector:
                 moments.normalize(seen, actor.observation)
             if step.ended:
                 self._note_ends(params, step, row, acting, final_values)
+        self.state.observation[:] = seen
 
     def _show(self) -> None:
         """Puts the current observations before the actor, normalised."""

@@ -24,18 +24,18 @@ class ObservationMoments:
         self.mean, self.variance, self.count = first
         self._envs, self._clip = envs, clip
         self._acting = np.ones((members, envs), bool)
-        self._counts = self.count[None]
+        self._fractions = self._remains = np.zeros((0, members, 1, 1))
         self._work = np.zeros((2, members, envs, size))
 
     def plan(self, acting: np.ndarray, steps: int) -> None:
-        """What the coming `steps` calls of `see` share: who acts `[P, N]`, and hence the counts."""
+        """Says who acts `[P, N]` in the coming `steps` calls of `see`; their counts follow now."""
         self._acting = acting
         if self._envs == 1:
             number = acting[:, :, None].astype(np.float64)
             added = np.concatenate([self.count[None], np.repeat(number[None], steps, 0)])
-            self._counts = np.add.accumulate(added)
-            self._fractions = number / self._counts[1:]
-            self._remains = self._counts[:-1] / self._counts[1:]
+            counts = np.add.accumulate(added)
+            self._fractions, self._remains = number / counts[1:], counts[:-1] / counts[1:]
+            self.count[:] = counts[-1]
 
     def see(self, observation: np.ndarray, step: int) -> None:
         """Lets `observation` `[P, N, D]` enter, as the `step`-th of the plan."""
@@ -51,7 +51,6 @@ class ObservationMoments:
         np.multiply(delta, move, out=move)
         np.add(self.variance, move, out=self.variance)
         np.multiply(self.variance, self._remains[step], out=self.variance)
-        self.count[:] = self._counts[step + 1]
 
     def normalize(self, observation: np.ndarray, out: np.ndarray) -> None:
         """Writes the normalised and clipped `observation` `[P, N, D]` to `out`, float32."""

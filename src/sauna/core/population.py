@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from sauna.config import Config
 from sauna.core.batch import make_batch
@@ -36,7 +37,7 @@ class Program(NamedTuple):
     value: Callable[[Any, Any], Array]
     decide: Callable[..., tuple[Any, Array]]
     make_batch: Callable[[Rollout, Hypers], Batch]
-    learn: Callable[[TrainState, Rollout, Batch, Hypers, Array], tuple[TrainState, UpdateMetrics]]
+    learn: Callable[[TrainState, Rollout, Batch, Hypers, Any], tuple[TrainState, UpdateMetrics]]
 
 
 def map_members(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -85,9 +86,15 @@ class Keys(NamedTuple):
     init: Array
     action: Array
     filter: Array
-    minibatch: Array
+
+
+def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
+    """The order of the samples in every epoch of an update, `[epochs, T * N]` int32."""
+    samples = np.arange(config.rollout_steps * config.envs, dtype=np.int32)
+    generator = np.random.default_rng([seed, iteration])
+    return generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)
 
 
 def member_keys(seed: int) -> Keys:
     """Keys that depend on the member's seed alone."""
-    return Keys(*jax.random.split(jax.random.key(seed), 4))
+    return Keys(*jax.random.split(jax.random.key(seed), 3))

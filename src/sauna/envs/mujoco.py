@@ -79,13 +79,12 @@ class BatchTask(Task):
         self._frame_skip = envs[0].frame_skip
         # Persistent views into MuJoCo's memory: making one costs as much as copying it.
         self._physics = [(env.model, env.data, env.data.ctrl) for env in envs]
-        self._copies = [
-            (self.qpos[i], env.data.qpos, self.qvel[i], env.data.qvel) for i, env in enumerate(envs)
-        ]
+        self._parts = [part for env in envs for part in (env.data.qpos, env.data.qvel)]
+        self._flat = self.state.reshape(-1)
 
     def gather(self, index: int) -> None:
-        qpos, now_qpos, qvel, now_qvel = self._copies[index]
-        qpos[:], qvel[:] = now_qpos, now_qvel
+        data = self.envs[index].data
+        self.qpos[index], self.qvel[index] = data.qpos, data.qvel
 
     def step(
         self,
@@ -96,14 +95,12 @@ class BatchTask(Task):
         terminated: np.ndarray,
     ) -> None:
         mj_step, frame_skip = mujoco.mj_step, self._frame_skip
-        for i, on in enumerate(active):
+        rows = action.astype(np.float64)
+        for (model, data, ctrl), row, on in zip(self._physics, rows, active, strict=True):
             if on:
-                model, data, ctrl = self._physics[i]
-                ctrl[:] = action[i]
+                ctrl[:] = row
                 mj_step(model, data, frame_skip)
-                qpos, now_qpos, qvel, now_qvel = self._copies[i]
-                qpos[:] = now_qpos
-                qvel[:] = now_qvel
+        np.concatenate(self._parts, out=self._flat)
         self.evaluate(action, observation, reward, terminated)
 
     def evaluate(
@@ -125,7 +122,7 @@ class Runner(BatchTask):
     def __init__(self, envs: list[Any]) -> None:
         super().__init__(envs)
         env = envs[0]
-        self._x = np.zeros(len(envs))
+        self._before, self._now = np.zeros(len(envs)), self.qpos[:, 0]
         self._dt, self._weight = env.dt, env._forward_reward_weight
         self._cost = env._ctrl_cost_weight
         skipped = env.observation_structure["skipped_qpos"]
@@ -134,7 +131,7 @@ class Runner(BatchTask):
 
     def gather(self, index: int) -> None:
         super().gather(index)
-        self._x[index] = self.qpos[index, 0]
+        self._before[index] = self._now[index]
 
     def evaluate(
         self,
@@ -143,9 +140,10 @@ class Runner(BatchTask):
         reward: np.ndarray,
         terminated: np.ndarray,
     ) -> None:
-        x = self.qpos[:, 0]
-        forward = (x - self._x) / self._dt * self._weight
-        self._x[:] = x
+        forward = self._now - self._before
+        forward /= self._dt
+        forward *= self._weight
+        self._before[:] = self._now
         cost = self._cost * np.add.reduce(np.square(action), 1)
         np.subtract(self._rewarded(forward, terminated), cost, out=reward)
         observation[:, : self._split] = self._position
