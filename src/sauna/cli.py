@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | list`.
+"""The command line: `sauna train | resume | eval | bench | list`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -55,6 +55,17 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
     evaluate.add_argument("--video", action="store_true", help="film the first episode")
+
+    text = "measure this machine: training, its parts, physics alone, other trainers"
+    bench = commands.add_parser("bench", help=text, allow_abbrev=False)
+    bench.add_argument("env", nargs="?", metavar="ENV", default="HalfCheetah-v5",
+                       help="default: HalfCheetah-v5")  # fmt: skip
+    bench.add_argument("--against", metavar="PEER", help="also run another trainer: sb3")
+    bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")
+    text = "iterations of each round's training (default 50)"
+    bench.add_argument("--iterations", default="50", help=text)
+    bench.add_argument("--json", metavar="FILE", help="also write the figures there")
+    _add_fields(bench, [n for n in FIELDS if n not in ("env", "steps", "out", "drop_rate_from")])
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
     lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
@@ -113,7 +124,7 @@ def _run(arguments: list[str]) -> None:
     if parsed.command is None:
         parser.print_help()
     else:
-        {"train": _train, "resume": _resume, "eval": _eval, "list": _list}[parsed.command](values)
+        _COMMANDS[parsed.command](values)
 
 
 def _subparser(parser: argparse.ArgumentParser, command: str | None) -> argparse.ArgumentParser:
@@ -160,10 +171,7 @@ def _resume(values: dict[str, Any]) -> None:
 
 def _eval(values: dict[str, Any]) -> None:
     run = Path(values.pop("run"))
-    for name, least in (("episodes", 1), ("seed", 0)):
-        if not values[name].isdigit() or int(values[name]) < least:
-            raise BadInput(f"{name}: must be a whole number of at least {least}")
-        values[name] = int(values[name])
+    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
     from sauna.evaluation import choose_renderer, evaluate
@@ -180,6 +188,34 @@ def _eval(values: dict[str, Any]) -> None:
               f"{row['episodes']} episodes")  # fmt: skip
     if "video" in result:
         print(f"video: {result['video']}")
+
+
+def _whole(values: dict[str, Any], name: str, least: int) -> int:
+    if not values[name].isdigit() or int(values[name]) < least:
+        raise BadInput(f"{name}: must be a whole number of at least {least}")
+    return int(values[name])
+
+
+def _bench(values: dict[str, Any]) -> None:
+    import json
+
+    rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 1)
+    against, file = values.pop("against"), values.pop("json")
+    if file and not Path(file).resolve().parent.is_dir():
+        raise BadInput(f"json: {Path(file).parent} is not a folder")
+    given = {"arm": "ppo", "seeds": 6, **values}
+    del given["rounds"], given["iterations"]
+    from sauna.bench.command import bench, report
+
+    result = bench(given, rounds=rounds, iterations=iterations, against=against, say=_say)
+    print("\n".join(report(result)))
+    if file:
+        Path(file).write_text(json.dumps(result, indent=1) + "\n")
+        print(f"figures: {file}")
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
 
 
 def _list(values: dict[str, Any]) -> None:
@@ -220,3 +256,4 @@ TARGET_HELP = dict(
         strict=True,
     )
 )
+_COMMANDS = {"train": _train, "resume": _resume, "eval": _eval, "bench": _bench, "list": _list}

@@ -19,7 +19,7 @@ def in_process_envs(
       backend: `auto`, or `gymnasium` to have every step taken by Gymnasium itself.
     """
     make = env_maker(env, env_kwargs)
-    if backend == "auto" and _is_mujoco(env):
+    if backend == "auto" and is_mujoco(env):
         from sauna.envs.mujoco import MujocoEnvs, time_limit
 
         first = make()
@@ -30,7 +30,7 @@ def in_process_envs(
     return GymnasiumEnvs(make, seeds)
 
 
-def _is_mujoco(env: str) -> bool:
+def is_mujoco(env: str) -> bool:
     """Whether a registered environment's class is one of Gymnasium's MuJoCo tasks."""
     import gymnasium
 

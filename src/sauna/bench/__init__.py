@@ -1,0 +1,1 @@
+"""How fast this machine trains, against its own physics and against other trainers."""

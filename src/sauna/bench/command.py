@@ -1,0 +1,151 @@
+"""`sauna bench`: the figures, a table of them, and a json file with the machine named."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sauna import rundir
+from sauna.bench.peers import peer_rate, prepare, versions
+from sauna.bench.rates import WARM_UP, alternate, physics_rate, ratio, training_rate
+from sauna.presets import resolve
+from sauna.run import plain
+
+SECONDS = 15.0  # that a peer or the physics is measured in each round
+
+
+def bench(
+    given: Mapping[str, Any],
+    *,
+    iterations: int,
+    rounds: int,
+    against: str | None,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Measures training with the settings `given` on this machine.
+
+    Args:
+      iterations: of each round's training, beyond the warm-up.
+      rounds: how often everything is measured, in turn.
+      against: a peer, or None.
+      say: is told of each figure.
+
+    Returns:
+      the figures; rates are env steps per second, summed over all processes.
+
+    Raises:
+      BadInput: the settings or the peer are not usable.
+    """
+    given = plain(given)
+    config = resolve(given)
+    processes = config.processes or os.cpu_count() or 1
+    processes = min(processes, len(config.seeds) * len(config.arm))
+    batch = config.rollout_steps * config.envs
+    given |= {"steps": batch * (iterations + WARM_UP), "processes": processes}
+    measures = {"training": lambda: training_rate(given)}
+    if _has_physics(config.env):
+        kwargs = json.loads(config.env_kwargs)
+        measures["physics"] = lambda: physics_rate(config.env, kwargs, processes, SECONDS / 3)
+    result: dict[str, Any] = {
+        "env": config.env,
+        "arm": list(config.arm),
+        "preset": config.preset,
+        "members": len(config.seeds) * len(config.arm),
+        "processes": processes,
+        "machine": rundir.machine(),
+        "versions": rundir.versions(),
+        "git": rundir.git_revision(),
+    }
+    if against:
+        python = prepare(against, say)
+        measures[against] = partial(peer_rate, python, config.env, processes, SECONDS)
+        result["peer"] = {"name": against, "processes": processes, "versions": versions(python)}
+    result["rates"] = rates = alternate(measures, rounds, say)
+    result["ratios"] = {
+        name: ratio(rates["training"], others)
+        for name, others in rates.items()
+        if name != "training"
+    }
+    say("where the time goes, in one process")
+    share = -(-result["members"] // processes)
+    result["split"] = _split_elsewhere({**given, "steps": batch * 100}, share)
+    result |= start_and_memory(given)
+    return result
+
+
+def _has_physics(env: str) -> bool:
+    from sauna.envs.backend import is_mujoco
+
+    return is_mujoco(env)
+
+
+def _split_elsewhere(given: Mapping[str, Any], share: int) -> dict[str, float]:
+    """`split` in a process that is set up as a training worker is."""
+    code = ("import json, sys; from sauna.worker import configure_jax; configure_jax(); "
+            "from sauna.bench.split import split; "
+            "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))")  # fmt: skip
+    command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(given), str(share)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def start_and_memory(given: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds from the command to the end of the first iteration, and the memory of one process.
+
+    A second run of the same settings, so that the compilation cache is warm. The first env step
+    comes before the first row does; the time told is the later one.
+    """
+    values = {**given, "processes": 1}
+    values["steps"] = resolve(values).rollout_steps * resolve(values).envs * 2
+    with tempfile.TemporaryDirectory() as folder:
+        settings = Path(folder) / "settings.json"
+        settings.write_text(json.dumps({**values, "out": os.path.join(folder, "run")}))
+        command = [sys.executable, "-m", "sauna", "train", "--config", str(settings)]
+        clock = time.time()
+        started = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        log = Path(folder) / "run" / "timing.jsonl"
+        while started.poll() is None and not (log.exists() and log.read_text()):
+            time.sleep(0.01)
+        first = time.time() - clock
+        rows = [json.loads(line) for line in log.read_text().splitlines()]
+        started.wait()
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    return {
+        "seconds_to_first_row": first,
+        "seconds_to_first_env_step": first - rows[0]["seconds"],
+        "peak_memory_mib": peak,
+    }
+
+
+def report(result: Mapping[str, Any]) -> list[str]:
+    """The figures as lines of text."""
+    rates, lines = result["rates"], []
+    middle = {name: sorted(values)[len(values) // 2] for name, values in rates.items()}
+    lines.append(
+        f"{result['env']}, {', '.join(result['arm'])}, {result['members']} members in "
+        f"{result['processes']} processes: {middle['training']:,.0f} env steps/s"
+    )
+    for name, found in result["ratios"].items():
+        text = "raw mj_step" if name == "physics" else f"{name} in as many processes"
+        lines.append(
+            f"  {found['median']:.2f} times {text} ({found['low']:.2f} to {found['high']:.2f}; "
+            f"{middle[name]:,.0f} per second)"
+        )
+    total = sum(result["split"].values())
+    lines.append(f"  one process, {total:.1f} us per env step:")
+    for name, value in result["split"].items():
+        lines.append(f"    {name:14} {value:6.2f} us  {value / total:5.1%}")
+    lines.append(
+        f"  first env step after {result['seconds_to_first_env_step']:.1f} s, at most "
+        f"{result['peak_memory_mib']:.0f} MiB in one process"
+    )
+    return lines

@@ -1,0 +1,154 @@
+"""What a training does per env step, as exact counts: a guard against slowing down unnoticed."""
+
+from __future__ import annotations
+
+import sys
+import tracemalloc
+from collections import Counter
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from helpers import make_job
+from sauna.collect.host import HostCollector
+from sauna.core.population import make_program, member_keys, minibatch_order
+from sauna.member_state import Counters
+from sauna.training import _hypers, _learn, _limit, make_envs
+
+STEPS, MEMBERS = 32, 3
+FUNCTIONS = ("draw", "act", "score", "value", "decide", "make_batch", "learn")
+
+
+class Trainer:
+    """The loop of `train_members`, counting the calls of compiled functions."""
+
+    def __init__(self, env: str, **settings: Any) -> None:
+        self.job = make_job(env, seeds=MEMBERS, rollout_steps=STEPS, steps=10**6, **settings)
+        self.calls: Counter[str] = Counter()
+        self.program = make_program(self.job.config, self.job.spaces)
+        counted = {name: self._counted(name) for name in FUNCTIONS}
+        self.keys = [member_keys(member.seed) for member in self.job.members]
+        self.envs = make_envs(self.job)
+        self.collector = HostCollector(
+            self.program._replace(**counted), self.job.spaces, self.envs, self.keys
+        )
+        self.collector.start()
+        self.counted = self.program._replace(**counted)
+        self.states = [self.program.init(k.init) for k in self.keys]
+        self.done = [Counters() for _ in self.keys]
+
+    def _counted(self, name: str) -> Any:
+        function = getattr(self.program, name)
+
+        def call(*arguments: Any) -> Any:
+            self.calls[name] += 1
+            return function(*arguments)
+
+        return call
+
+    def collect(self, iteration: int) -> list:
+        job = self.job
+        hypers = [_hypers(job, p, self.done[p], iteration) for p in range(MEMBERS)]
+        limit = np.array([_limit(job.config, c) for c in self.done])
+        params = np.stack([np.asarray(state.params) for state in self.states])
+        return [self.collector.collect(params, hypers, iteration, limit), hypers]
+
+    def iterate(self, iteration: int) -> int:
+        collected, hypers = self.collect(iteration)
+        for p, member in enumerate(self.job.members):
+            order = minibatch_order(self.job.config, member.seed, iteration)
+            self.states[p], _ = _learn(self.counted, self.states[p], collected[p], hypers[p], order)
+            self.done[p].add(collected[p])
+        return max(c.rollout.valid.any(1).sum() for c in collected)
+
+
+def test_compiled_calls_per_rollout() -> None:
+    """None per env step: drawing, scoring, the last value, the batch and the update, once each."""
+    trainer = Trainer("HalfCheetah-v5", arm="ppo")
+    trainer.iterate(0)
+    trainer.calls.clear()
+    trainer.iterate(1)
+    once = dict.fromkeys(("draw", "score", "value", "make_batch", "learn"), MEMBERS)
+    assert trainer.calls == once
+    trainer.envs.close()
+
+
+def test_a_network_of_another_kind_acts_by_one_call_per_step() -> None:
+    trainer = Trainer("worlds:Scripted", arm="ppo", network="test_networks:Sine")
+    trainer.iterate(0)
+    trainer.calls.clear()
+    assert trainer.iterate(1) == STEPS
+    assert trainer.calls["act"] == STEPS
+    assert trainer.calls["score"] == MEMBERS
+    trainer.envs.close()
+
+
+@pytest.mark.parametrize("arm", ["ppo", "sauna"])
+def test_nothing_is_compiled_after_the_first_iterations(arm: str) -> None:
+    """A filtered arm meets the lengths of its stretches at once here, being told to drop a lot."""
+    settings = {"threshold": 1.0} if arm == "sauna" else {}
+    trainer = Trainer("InvertedPendulum-v5", arm=arm, **settings)
+    for iteration in range(2):
+        trainer.iterate(iteration)
+    compiled: list[str] = []
+    listen = jax.monitoring.register_event_duration_secs_listener
+    listen(lambda event, seconds, **more: compiled.append(event) if "compil" in event else None)
+    for iteration in range(2, 6):
+        trainer.iterate(iteration)
+    assert compiled == []
+    jax.jit(lambda x: x + 1.25)(1.0)
+    assert compiled != []  # the listener does hear compilations
+    trainer.envs.close()
+
+
+def test_python_calls_per_vector_step() -> None:
+    """Python functions and methods of C called for one vector step of three members."""
+    trainer = Trainer("HalfCheetah-v5", arm="ppo")
+    trainer.iterate(0)
+    seen: Counter[str] = Counter()
+
+    def count(frame: Any, event: str, argument: Any) -> None:
+        if event == "call":
+            seen[frame.f_code.co_name] += 1
+        elif event == "c_call":
+            seen[argument.__name__] += 1
+
+    params = np.stack([np.asarray(state.params) for state in trainer.states])
+    trainer.collector._actor.load(params)
+    noise = np.zeros((STEPS, MEMBERS, 1, 6), np.float32)
+    acting = np.ones((MEMBERS, 1), bool)
+    sys.setprofile(count)
+    try:
+        trainer.collector._act(params, noise, 0, STEPS, acting, {})
+    finally:
+        sys.setprofile(None)
+    per_step = {name: n // STEPS for name, n in seen.items() if n >= STEPS}
+    assert per_step == PER_STEP
+    trainer.envs.close()
+
+
+# numpy's ufuncs are not seen by a profiler. `append` is the record of actions to replay; two of the
+# three `reshape` and the `lambda`s are views and tuples, not copies.
+PER_STEP = {
+    "step": 2, "act": 1, "<lambda>": 2, "tolist": 2, "astype": 1, "mj_step": MEMBERS,
+    "concatenate": 1, "evaluate": 1, "reduce": 1, "_rewarded": 1, "append": MEMBERS + 1,
+    "len": MEMBERS + 1, "dot": 2, "_told": 1, "__new__": 1, "reshape": 3, "see": 1, "normalize": 1,
+}  # fmt: skip
+
+
+def test_memory_does_not_grow() -> None:
+    """Between two resets every env keeps its actions (to be replayed), and nothing else is kept."""
+    trainer = Trainer("HalfCheetah-v5", arm="ppo")
+    for iteration in range(3):
+        trainer.iterate(iteration)
+    tracemalloc.start()
+    trainer.iterate(3)
+    before = tracemalloc.get_traced_memory()[0]
+    for iteration in range(4, 12):
+        trainer.iterate(iteration)
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown / (8 * STEPS * MEMBERS) < 400  # bytes per env step: the action and its view
+    trainer.envs.close()
