@@ -15,7 +15,19 @@ ALLOWED = {
     "selection": {"core.types"},
     "envs": {"spaces", "wire"},
     "collect": {"core", "envs.contract", "spaces"},
-    "metrics": {"presets", "rundir", "collect", "core", "member_state"},
+    "metrics": {"presets", "rundir", "collect", "core", "member_state", "style"},
+    "study": {"presets", "rundir", "run", "style", "envs.probe", "metrics.display"},
+    "bench": {
+        "presets",
+        "rundir",
+        "run",
+        "training",
+        "core",
+        "collect",
+        "envs",
+        "metrics.rows",
+        "member_state",
+    },
 }
 
 

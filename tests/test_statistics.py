@@ -158,7 +158,7 @@ def test_many_runs_take_the_normal_approximation_without_a_jump() -> None:
     random = np.random.default_rng(0)
     x, y = random.normal(0.4, 1, 50), random.normal(size=50)
     approximate = stats.mannwhitneyu(x, y, method="asymptotic").pvalue
-    np.testing.assert_allclose(s.exact_p(x, y), approximate, rtol=0.02)
+    np.testing.assert_allclose(s.exact_p(x, y), approximate, rtol=0.05)
     assert 0 < s.exact_p(np.append(x, 0.1), y) < 1
 
 
@@ -276,6 +276,7 @@ def test_verdicts() -> None:
     assert (few.kind, few.least, few.needed) == ("too few", 4, 6)
     assert s.compare({"x": high[:0]}, low)["x"] == ("too few", (None, None, None), 1.0, 4, None)
     assert s.compare({"x": high[:1]}, low)["x"].needed is None
+    assert s.compare({"x": high[:2]}, np.arange(8.0))["x"].kind == "too few"  # by the interval
     assert s.compare({}, low) == {}
 
 

@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | bench | list`.
+"""The command line: `sauna train | resume | eval | compare | study | bench | list`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -16,9 +16,11 @@ from typing import Any, NoReturn
 from sauna import __version__
 from sauna.config import FIELDS, FILTERS, TYPES, VEX_TARGETS, flag
 from sauna.errors import BadInput, Interrupted, SaunaError, nearest
-from sauna.presets import ARM_HELP, PRESET_HELP, given_by
+from sauna.presets import ARM_HELP, PRESET_HELP, given_by, parse_all
 
-LISTS = ("envs", "arms", "presets", "filters", "targets")
+LISTS = ("envs", "arms", "presets", "filters", "targets", "studies")
+# Fields that a comparison decides itself.
+_STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -55,6 +57,22 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
     evaluate.add_argument("--video", action="store_true", help="film the first episode")
+
+    text = "does filtering help on ENV? Trains several arms and says what the data support"
+    compare = commands.add_parser("compare", help=text, allow_abbrev=False)
+    compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
+    text = "what to compare; the first is the baseline (default ppo,vex-head,random-drop,sauna)"
+    compare.add_argument("--arms", default="ppo,vex-head,random-drop,sauna", help=text)
+    _add_fields(compare, [n for n in FIELDS if n not in _STUDYS])
+
+    study = commands.add_parser("study", help="run a study of the paper's, or your own",
+                                allow_abbrev=False)  # fmt: skip
+    study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
+    for command in (compare, study):
+        command.add_argument("--out", default="runs", metavar="DIR",
+                             help="where runs and results go (default runs)")  # fmt: skip
+        text = "trainings at a time (default: one per core)"
+        command.add_argument("--processes", default="0", metavar="N", help=text)
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
@@ -196,6 +214,36 @@ def _whole(values: dict[str, Any], name: str, least: int) -> int:
     return int(values[name])
 
 
+def _compare(values: dict[str, Any]) -> None:
+    from sauna.study.command import comparison
+
+    env, arms = values.pop("env"), values.pop("arms")
+    if not env:
+        raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
+    out, processes = values.pop("out"), values.pop("processes")
+    flags = "".join(f" {flag(name)} {value}" for name, value in values.items())
+    values = {"seeds": 6, **parse_all(values)}
+    spec = comparison(env, tuple(arms.split(",")), values)
+    _run_study(spec, out, processes, f"sauna compare {env} --arms {arms}{flags}")
+
+
+def _study(values: dict[str, Any]) -> None:
+    from sauna.study.spec import load_spec
+
+    name, out, processes = values["study"], values["out"], values["processes"]
+    _run_study(load_spec(name), out, processes, f"sauna study {name}")
+
+
+def _run_study(spec: Any, out: str, processes: str, command: str) -> None:
+    from sauna.study.command import lines, study
+
+    jobs = _whole({"processes": processes}, "processes", 0) or os.cpu_count() or 1
+    command += f" --out {out}" if out != "runs" else ""
+    summary = study(spec, Path(out), command, jobs, _say)
+    print("\n".join(lines(summary)))
+    print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
+
+
 def _bench(values: dict[str, Any]) -> None:
     import json
 
@@ -225,6 +273,11 @@ def _list(values: dict[str, Any]) -> None:
 
         for name in sorted(gymnasium.registry):
             print(name)
+    elif what == "studies":
+        from sauna.study.spec import built_in
+
+        for name, text in built_in().items():
+            print(f"{name:10} {text.splitlines()[0].removeprefix('# ')}")
     else:
         known = {"arms": ARM_HELP, "presets": PRESET_HELP,
                  "filters": FILTER_HELP, "targets": TARGET_HELP}[what]  # fmt: skip
@@ -256,4 +309,5 @@ TARGET_HELP = dict(
         strict=True,
     )
 )
-_COMMANDS = {"train": _train, "resume": _resume, "eval": _eval, "bench": _bench, "list": _list}
+_COMMANDS = {"train": _train, "resume": _resume, "eval": _eval, "compare": _compare,
+             "study": _study, "bench": _bench, "list": _list}  # fmt: skip

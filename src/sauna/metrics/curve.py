@@ -7,17 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sauna import rundir
+from sauna import rundir, style
 
-# Okabe and Ito's palette, which the colour-blind can tell apart; an arm always has its colour.
-COLOURS = {
-    "ppo": "#0072B2",
-    "vex-head": "#E69F00",
-    "random-drop": "#999999",
-    "sauna": "#D55E00",
-    "sauna-paper": "#CC79A7",
-    "sauna-reference": "#009E73",
-}
 GRID = 100  # points at which members' curves are compared
 
 
@@ -53,35 +44,34 @@ def draw_curve(run: Path) -> Path | None:
     curves = member_curves(rundir.rows(run))
     if not curves:
         return None
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     config = rundir.read_config(run)["config"]
-    figure, axes = plt.subplots(figsize=(7, 4.2), dpi=150)
-    for arm, members in curves.items():
-        colour = COLOURS.get(arm, "#000000")
-        for x, y in members.values():
-            axes.plot(x, y, color=colour, alpha=0.3, linewidth=0.8)
-        first = max(x[0] for x, _ in members.values())
-        last = min(x[-1] for x, _ in members.values())
-        grid = np.linspace(first, last, GRID)
-        values = np.stack([np.interp(grid, x, y) for x, y in members.values()])
-        label = f"{arm}, mean of {len(members)} seed{'s' if len(members) > 1 else ''}"
-        if len(members) > 1:
-            axes.fill_between(grid, *interval(values), color=colour, alpha=0.2, linewidth=0)
-            label += " and 95% interval"
-        axes.plot(grid, values.mean(0), color=colour, linewidth=2, label=label)
-    axes.set_xlabel("env steps")
-    axes.set_ylabel("training return\n(last 100 episodes)")
-    axes.set_title(f"{config['env']}, preset {config['preset']}", fontsize=10)
-    axes.legend(frameon=False, fontsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 4))
-    path = run / "figures" / "learning_curve.png"
-    path.parent.mkdir(exist_ok=True)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
-    return path
+    looks = style.looks({arm: arm for arm in curves})
+    with style.applied():
+        figure = Figure(figsize=(7, 4.2), layout="tight")
+        axes = figure.subplots()
+        for arm, members in curves.items():
+            _draw_arm(axes, arm, members, looks[arm])
+        axes.set_ylabel("training return\n(last 100 episodes)")
+        axes.set_title(f"{config['env']}, preset {config['preset']}")
+        axes.legend()
+        style.count_steps(axes)
+        return style.save(figure, run / "figures" / "learning_curve.png")
+
+
+def _draw_arm(
+    axes: Any, arm: str, members: dict[str, tuple[np.ndarray, np.ndarray]], look: style.Look
+) -> None:
+    for x, y in members.values():
+        axes.plot(x, y, color=look.colour, alpha=0.3, linewidth=0.8)
+    first = max(x[0] for x, _ in members.values())
+    last = min(x[-1] for x, _ in members.values())
+    grid = np.linspace(first, last, GRID)
+    values = np.stack([np.interp(grid, x, y) for x, y in members.values()])
+    label = f"{arm}, mean of {len(members)} seed{'s' if len(members) > 1 else ''}"
+    low = high = np.full(GRID, np.nan)
+    if len(members) > 1:
+        low, high = interval(values)
+        label += " and 95% interval"
+    style.draw_line(axes, look, grid, values.mean(0), low, high, label=label)

@@ -1,0 +1,1 @@
+"""Studies: arms compared over tasks and seeds, and what the comparison supports."""

@@ -1,0 +1,165 @@
+"""`sauna compare` and `sauna study`: train what is missing, then say what was found."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sauna import rundir
+from sauna.envs.probe import probe
+from sauna.errors import BadInput, Interrupted
+from sauna.study.local import LocalExecutor
+from sauna.study.results import gather
+from sauna.study.spec import Spec, check, load_spec, read_spec
+from sauna.study.summary import summarize
+from sauna.study.units import Unit, seeds_per_unit, units_of
+from sauna.study.view import StudyView
+
+COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+
+
+def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
+    """The study that `sauna compare ENV` runs: its folder is named after its settings.
+
+    Raises:
+      BadInput: unknown arms or settings that cannot be used.
+    """
+    values = {"tasks": [env], "arms": [{"label": arm} for arm in arms], **settings}
+    text = json.dumps(values, sort_keys=True, default=list)
+    place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
+    return read_spec({"name": f"compare_{place}_{digest}", "baseline": arms[0], **values})
+
+
+def study(
+    spec: Spec, out: Path, command: str, jobs: int, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Trains what is missing of `spec` and writes results, summary, report and figures.
+
+    Everything is under `out`: `units/` holds the runs, `NAME/` what was found.
+
+    Returns:
+      the summary.
+
+    Raises:
+      BadInput: an environment cannot be used.
+      Interrupted: a signal came; running again continues.
+    """
+    for task in spec.tasks:
+        for arm in spec.arms:
+            if task in arm.tasks:
+                probe(task, json.loads(check(arm, task).env_kwargs))
+                break
+    place, folder = out / spec.name, out / "units"
+    units = units_of(spec, _unit_size(spec, place, jobs))
+    folder.mkdir(exist_ok=True)
+    view = StudyView(spec, units, folder)
+    say(f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, "
+        f"{sum(len(unit.seeds) for unit in units)} members; writing to {place}")  # fmt: skip
+    with _signals() as noted:
+        view.open()
+        try:
+            LocalExecutor(folder, jobs, view, lambda: bool(noted)).run(units)
+        finally:
+            view.close()
+    summary = write(spec, units, folder, place, command)
+    if noted:
+        name = signal.Signals(noted[0]).name
+        raise Interrupted(noted[0], f"stopped by {name}; continue with: {command}")
+    return summary
+
+
+def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
+    """Seeds per unit: as when the study began, so that its units are found again.
+
+    Raises:
+      BadInput: the folder holds another study of this name, or cannot be made.
+    """
+    path = place / "study.json"
+    if path.is_file():
+        stored = json.loads(path.read_text())
+        if stored["study"] != spec.text:
+            raise BadInput(f"study: {place} holds another study of this name; give --out")
+        return int(stored["seeds_per_unit"])
+    size = seeds_per_unit(spec, jobs)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
+    rundir.write_json(path, {"study": spec.text, "seeds_per_unit": size})
+    return size
+
+
+def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
+    """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
+    from sauna.study.report import write_report
+
+    results = gather(spec, units, folder, command)
+    summary = summarize(results)
+    rundir.write_json(place / "results.json", results)
+    rundir.write_json(place / "summary.json", summary)
+    write_report(results, summary, place)
+    return summary
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """The signals that asked to stop; the second one stops at once."""
+    noted: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        if noted:
+            raise Interrupted(number, "stopped at once; running again continues")
+        noted.append(number)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, note) for number in numbers]
+    try:
+        yield noted
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def lines(summary: Mapping[str, Any]) -> list[str]:
+    """The table and the verdicts, as text."""
+    head = ["task", "arm", "seeds", "final return, IQM", "area, IQM", "mean +- std", "keep rate",
+            "env steps", "P(better)"]  # fmt: skip
+    rows = [head, *(_row(row) for row in summary["table"])]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
+    return [*(line.rstrip() for line in table), "", *(v["text"] for v in summary["verdicts"])]
+
+
+def _row(row: Mapping[str, Any]) -> list[str]:
+    failed = f" ({row['failed']} failed)" if row["failed"] else ""
+    mean, std = _number(row["final_mean"]), _number(row["final_std"])
+    return [
+        row["task"], row["label"], f"{row['seeds']}{failed}", _interval(row["final_iqm"]),
+        _interval(row["area_iqm"]), f"{mean} +- {std}", _number(row["keep_rate"], 3),
+        _number(row["env_steps"], 0), _interval(row["improvement"], 2),
+    ]  # fmt: skip
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def _interval(values: list[float | None] | None, digits: int = 1) -> str:
+    if values is None or values[0] is None:
+        return "-"
+    value, low, high = (_number(v, digits) for v in values)
+    return value if low == "-" else f"{value} [{low}, {high}]"
+
+
+def cores() -> int:
+    return os.cpu_count() or 1
+
+
+__all__ = ["COMPARED", "comparison", "cores", "lines", "load_spec", "study", "write"]

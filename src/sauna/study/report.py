@@ -1,0 +1,179 @@
+"""The report of a study: one HTML page that needs no network and no other file.
+
+Everything a reader must not miss (verdict, table, errors, settings) is plain HTML, and the figures
+are pictures; `page/report.js` puts figures that answer to pointer and keyboard in their place.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from sauna.study import tables
+from sauna.study.figures import Panel, Plot, looks_of, plots_of, write_figures
+from sauna.style import Look, short
+
+# A shape beside the colour of each kind of verdict.
+MARKS = {
+    "better": "\N{BLACK UP-POINTING TRIANGLE}",
+    "worse": "\N{BLACK DOWN-POINTING TRIANGLE}",
+    "no evidence": "\N{WHITE CIRCLE}",
+    "too few": "\N{HORIZONTAL ELLIPSIS}",
+}
+UNFOLDED = 5  # verdicts that are shown with all their words
+
+
+def write_report(results: dict[str, Any], summary: dict[str, Any], folder: Path) -> Path:
+    """Writes `folder/report.html` and `folder/figures/`; the same bytes for the same input.
+
+    Args:
+      results: what `results.json` holds.
+      summary: what `summary.json` holds.
+      folder: made where it is missing.
+
+    Returns:
+      The page.
+    """
+    pictures = write_figures(results, summary, folder)
+    path = folder / "report.html"
+    folder.mkdir(parents=True, exist_ok=True)
+    path.write_text(make_page(results, summary, pictures), encoding="utf-8")
+    return path
+
+
+def make_page(
+    results: Mapping[str, Any], summary: Mapping[str, Any], pictures: Mapping[str, Path]
+) -> str:
+    """The page as text; `pictures` are the SVG files that it shows where no script runs."""
+    script, css, page = (_asset(f"report.{kind}") for kind in ("js", "css", "html"))
+    looks, plots = looks_of(results), plots_of(results, summary)
+    return Template(page).substitute(
+        style=css + line_colours(looks),
+        script=script,
+        # The browser runs this one script and fetches nothing, whatever a label may hold.
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        data=embedded(page_data(looks, plots)),
+        title=escape(results["name"]),
+        scope=scope(results),
+        verdicts=verdicts(summary["verdicts"]),
+        table=tables.main_table(results, summary),
+        over_tasks=tables.over_tasks(results, summary),
+        metric=escape(results["metric"]),
+        baseline=escape(results["baseline"]),
+        figures="".join(figure(plot, pictures[plot.name]) for plot in plots)
+        or "<p>There is nothing to draw yet.</p>",
+        layout="one-task" if len(summary["curves"]) == 1 else "",
+        paper=tables.paper(summary["table"]),
+        failures=tables.failures(results["cells"]),
+        settings=tables.settings(results),
+        command=escape(results["command"]),
+    )
+
+
+def _asset(name: str) -> str:
+    return (files("sauna.study") / "page" / name).read_text(encoding="utf-8")
+
+
+def scope(results: Mapping[str, Any]) -> str:
+    """How much was trained, and what is missing."""
+    cells = results["cells"]
+    counts = Counter(member["status"] for cell in cells for member in cell["members"])
+    parts = [
+        _plural(len({cell["task"] for cell in cells}), "task"),
+        _plural(len({cell["label"] for cell in cells}), "arm"),
+        _plural(counts.total(), "training"),
+    ]
+    if unfinished := counts["running"] + counts["waiting"]:
+        parts.append(f"<strong>{unfinished} not finished yet</strong>")
+    if counts["failed"]:
+        parts.append(f'<a href="#failed"><strong>{counts["failed"]} failed</strong></a>')
+    return f" {tables.DOT} ".join(parts)
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def verdicts(found: Sequence[Mapping[str, Any]]) -> str:
+    """Each verdict, its kind in words and shape; of many, what they rest on is folded away."""
+    if not found:
+        return "<p>Nothing is compared: there is no arm beside the baseline.</p>"
+    many = len(found) > UNFOLDED
+    items = "".join(
+        f'<li class="{escape(v["kind"].replace(" ", "-"))}"><details{"" if many else " open"}>'
+        f'<summary><span class="kind"><span aria-hidden="true">{MARKS.get(v["kind"], "")}</span> '
+        f"{escape(v['kind'])}</span> <b>{escape(v['label'])}</b> on {escape(v['task'])}</summary>"
+        f"<p>{escape(v['text'])}</p></details></li>\n"
+        for v in found
+    )
+    counts = Counter(v["kind"] for v in found)
+    total = ", ".join(f"{count} {escape(kind)}" for kind, count in counts.items())
+    head = f"<p>{_plural(len(found), 'comparison')}: {total}.</p>" if many else ""
+    return f'{head}<ul class="verdicts">{items}</ul>'
+
+
+def figure(plot: Plot, picture: Path) -> str:
+    """A figure as a picture, which the script replaces."""
+    data = base64.b64encode(picture.read_bytes()).decode()
+    text = escape(" ".join(panel_text(plot, panel) for panel in plot.panels))
+    return (
+        f'<figure id="{plot.name}"><h3>{plot.title}</h3><figcaption>{plot.caption}</figcaption>'
+        f'<img alt="{text}" src="data:image/svg+xml;base64,{data}"></figure>\n'
+    )
+
+
+def panel_text(plot: Plot, panel: Panel) -> str:
+    """What a panel shows, in words: the last value of each line (the middle one of a profile)."""
+    values = []
+    for line in panel.lines:
+        points = [(x, y) for x, y in zip(line.x, line.y, strict=True) if None not in (x, y)]
+        x, y = points[len(points) // 2 if plot.name == "profiles" else -1]
+        values.append(f"{line.label} {y:.4g} at {short(x or 0)}")
+    said = "; ".join(values) or "no data"
+    return f"{plot.title} of {panel.task}, {plot.y_label} by {plot.x_label}: {said}."
+
+
+def embedded(value: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def line_colours(looks: Mapping[str, Look]) -> str:
+    """The labels' colours as variables, for light and for dark pages."""
+    light = "".join(f"--line{i}:{look.colour};" for i, look in enumerate(looks.values()))
+    dark = "".join(f"--line{i}:{look.colour_on_dark};" for i, look in enumerate(looks.values()))
+    return f":root{{{light}}}\n@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}\n"
+
+
+def page_data(looks: Mapping[str, Look], plots: Sequence[Plot]) -> dict[str, Any]:
+    """What the script draws."""
+    labels = [
+        {"label": label, "dash": " ".join(f"{d:g}" for d in look.dash), "marker": look.marker}
+        for label, look in looks.items()
+    ]
+    drawn = [asdict(plot) for plot in plots]
+    for plot, values in zip(plots, drawn, strict=True):
+        for panel, shown in zip(plot.panels, values["panels"], strict=True):
+            shown["text"] = panel_text(plot, panel)
+    return {"labels": labels, "plots": rounded(drawn)}
+
+
+def rounded(value: Any) -> Any:
+    """A JSON value with its numbers to five digits, and null for those that are not finite."""
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.5g}") if math.isfinite(value) else None
+    return value

@@ -1,0 +1,124 @@
+"""What a study has found so far, gathered from the runs of its units: `results.json`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sauna import rundir
+from sauna.config import to_json
+from sauna.study.spec import Arm, Spec, check
+from sauna.study.statistics import area_under_curve
+from sauna.study.units import Unit, parts
+
+FORMAT = 1
+POINTS = 60  # of each member's curve that are kept
+METRIC = "mean training return (sampled actions) of the last 100 episodes"
+CURVES = ("return_mean", "keep_rate", "vex_mean", "vex_spread", "vex_median",
+          "explained_variance", "entropy")  # fmt: skip
+DIGITS = 6  # significant digits of a curve's points
+
+
+def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[str, Any]:
+    """Everything that is known, one entry per trained member; see `docs/studies.md`."""
+    cells = [
+        _cell(arm, task, [u for u in units if (u.label, u.task) == (arm.label, task)], folder)
+        for task in spec.tasks
+        for arm in spec.arms
+        if task in arm.tasks
+    ]
+    top = {key: value for key, value in spec.text.items() if key != "arms"}
+    return {
+        "format": FORMAT,
+        "name": spec.name,
+        "command": command,
+        "metric": METRIC,
+        "baseline": spec.baseline,
+        "settings": top,
+        **_made_with(units, folder),
+        "cells": cells,
+    }
+
+
+def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
+    """Versions and machines of the runs; each difference is listed."""
+    found: dict[str, list[Any]] = {"versions": [], "machine": [], "git": []}
+    for unit in units:
+        for part in parts(unit, folder):
+            path = part.run(folder) / "config.json"
+            stored = json.loads(path.read_text()) if path.is_file() else {}
+            for name, values in found.items():
+                if name in stored and stored[name] not in values:
+                    values.append(stored[name])
+    return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
+
+
+def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any]:
+    members = [member for unit in units for member in _members(unit, folder)]
+    config = to_json(check(arm, task))
+    flags = {"arm": arm.arm, "seeds": ",".join(map(str, arm.seeds)) + ",", **arm.settings}
+    if arm.rates_of is not None:
+        config["drop_rate_from"] = flags["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
+    text = " ".join(f"--{key.replace('_', '-')} {_shown(value)}" for key, value in flags.items())
+    return {
+        "task": task,
+        "label": arm.label,
+        "arm": arm.arm,
+        "baseline": arm.baseline,
+        "preset": config["preset"],
+        "config": config,
+        "command": f"sauna train {task} {text}",
+        "members": sorted(members, key=lambda member: arm.seeds.index(member["seed"])),
+    }
+
+
+def _shown(value: Any) -> str:
+    text = ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return f"'{text}'" if " " in text or "," in text else text
+
+
+def _members(unit: Unit, folder: Path) -> list[dict[str, Any]]:
+    found = []
+    for part in parts(unit, folder):
+        rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in part.seeds}
+        for row in rundir.rows(part.run(folder)):
+            rows[row["seed"]].append(row)
+        for seed in part.seeds:
+            error = part.error(folder)
+            status = "running" if rows[seed] else "waiting"
+            if part.is_complete(folder):
+                status = "complete"
+            elif error is not None:
+                status = "failed"
+            found.append({"seed": seed, "status": status, "error": error, **_ended(rows[seed])})
+    return found
+
+
+def _ended(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """A member's last numbers and its thinned curve."""
+    last = rows[-1] if rows else {}
+    steps = np.array([row["env_steps"] for row in rows], float)
+    returns = np.array([row.get("return_mean", np.nan) for row in rows], float)
+    kept, tried = last.get("kept_steps"), last.get("env_steps")
+    return {
+        "final_return": last.get("return_mean"),
+        "area": area_under_curve(steps, returns) if rows else None,
+        "env_steps": tried,
+        "kept_steps": kept,
+        "keep_rate": kept / tried if kept is not None and tried else None,
+        "episodes": last.get("episodes"),
+        "explained_variance": last.get("explained_variance"),
+        "curve": _curve(rows),
+    }
+
+
+def _curve(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    chosen = np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int)).tolist()
+    thinned = [rows[i] for i in chosen] if rows else []
+    curve: dict[str, list[Any]] = {"env_steps": [row["env_steps"] for row in thinned]}
+    for name in CURVES:
+        curve[name] = [float(f"{row[name]:.{DIGITS}g}") if name in row else None for row in thinned]
+    return curve

@@ -1,0 +1,188 @@
+"""What a study trains: tasks x arms x seeds, from a small declarative file.
+
+    name = "mine"
+    tasks = ["Hopper-v5", "HalfCheetah-v5"]
+    seeds = 6
+    steps = 1e6
+
+    [[arms]]
+    label = "ppo"
+
+    [[arms]]
+    label = "sauna 0.8"
+    arm = "sauna"
+    threshold = 0.8
+
+Any setting of a run may stand at the top, for all arms, or in an arm. `baseline` is the label that
+others are compared with. An arm may name its own `tasks`, `seeds` and `baseline`; a `random-drop`
+arm repeats the measured drop rates of the arm `rates_of`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sauna.config import FIELDS, Config, parse
+from sauna.errors import BadInput, nearest
+from sauna.presets import ARMS, resolve
+
+# What a study decides itself.
+_OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard")
+_TOP = ("name", "tasks", "seeds", "baseline", "arms")
+_ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
+
+
+class Arm(NamedTuple):
+    """One line of a comparison: a method with its settings, on some tasks and seeds."""
+
+    label: str
+    arm: str
+    settings: dict[str, Any]  # as a user would give them, without env and seeds
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    baseline: str | None  # the label it is compared with
+    rates_of: str | None  # the label whose drop rates it repeats
+
+    def given(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
+        """The settings of a run of some seeds on one task."""
+        return {**self.settings, "env": task, "arm": self.arm, "seeds": list(seeds)}
+
+
+class Spec(NamedTuple):
+    """A whole study; `text` is what it was read from, as JSON values."""
+
+    name: str
+    baseline: str
+    arms: list[Arm]
+    text: dict[str, Any]
+
+    @property
+    def tasks(self) -> list[str]:
+        return list(dict.fromkeys(task for arm in self.arms for task in arm.tasks))
+
+
+def read_spec(values: Mapping[str, Any]) -> Spec:
+    """The study that `values` describe.
+
+    Raises:
+      BadInput: an unknown key, a label twice or unknown, or settings that cannot be used.
+    """
+    for key in values:
+        if key not in _TOP and (key not in FIELDS or key in _OWN):
+            known = [*_TOP, *(name for name in FIELDS if name not in _OWN)]
+            raise BadInput(f"study: unknown key {key!r}{nearest(key, known)}")
+    common = {key: value for key, value in values.items() if key not in _TOP}
+    entries = values.get("arms") or []
+    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
+        raise BadInput("study: arms must be a list of tables")
+    if not entries:
+        raise BadInput("study: no arms")
+    arms = [_read_arm(dict(entry), values, common) for entry in entries]
+    labels = [arm.label for arm in arms]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise BadInput(f"study: the label {label!r} is given twice")
+    baseline = str(values.get("baseline", labels[0]))
+    arms = [_settle(arm, arms, baseline) for arm in arms]
+    spec = Spec(str(values.get("name", "study")), baseline, arms, _plain(values))
+    for arm in arms:
+        for task in arm.tasks:
+            check(arm, task)
+    return spec
+
+
+def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, Any]) -> Arm:
+    for key in entry:
+        if key not in _ARM and (key not in FIELDS or key in _OWN):
+            known = [*_ARM, *(name for name in FIELDS if name not in _OWN)]
+            raise BadInput(f"study: unknown key {key!r} in an arm{nearest(key, known)}")
+    arm = entry.get("arm", entry.get("label"))
+    if arm not in ARMS:
+        raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)})"
+                       f"{nearest(str(arm), ARMS)}")  # fmt: skip
+    tasks = entry.get("tasks", top.get("tasks"))
+    if not isinstance(tasks, list) or not tasks:
+        raise BadInput("study: tasks must be a list of environments")
+    seeds = parse("seeds", entry.get("seeds", top.get("seeds", 6)))
+    own = {key: value for key, value in entry.items() if key not in _ARM}
+    return Arm(
+        str(entry.get("label", arm)), arm, {**common, **own}, tuple(map(str, tasks)), seeds,
+        entry.get("baseline"), entry.get("rates_of"),
+    )  # fmt: skip
+
+
+def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
+    """Fills in what an arm left open: its baseline, and whose drop rates it repeats."""
+    known = {other.label: other for other in arms}
+    source = arm.rates_of
+    if arm.arm == "random-drop" and source is None and "drop_rate" not in arm.settings:
+        filtered = [a.label for a in arms if ARMS[a.arm]["filter"] == "sauna"]
+        if not filtered:
+            raise BadInput("study: random-drop needs a filtered arm whose rates it repeats")
+        source = filtered[0]
+    if source is not None and arm.arm != "random-drop":
+        raise BadInput(f"study: rates_of is read by random-drop only, not by {arm.label!r}")
+    for name in (arm.baseline, source, baseline):
+        if name is not None and name not in known:
+            raise BadInput(f"study: there is no arm {name!r}{nearest(name, known)}")
+    if source is not None:
+        missing = set(arm.tasks) - set(known[source].tasks)
+        if missing or set(arm.seeds) - set(known[source].seeds):
+            raise BadInput(f"study: {source!r} does not have every task and seed of {arm.label!r}")
+    own = arm.baseline or (None if arm.label == baseline else baseline)
+    return arm._replace(baseline=own, rates_of=source)
+
+
+def check(arm: Arm, task: str) -> Config:
+    """The config of a run of `arm`; a random-drop arm's source is settled later.
+
+    Raises:
+      BadInput: the settings cannot be used; the label is named.
+    """
+    given = arm.given(task, arm.seeds)
+    if arm.rates_of is not None:
+        given["drop_rate_from"] = "the source"
+    try:
+        return resolve(given)
+    except BadInput as error:
+        raise BadInput(f"study, arm {arm.label!r}: {error}") from None
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    import json
+
+    return dict(json.loads(json.dumps(values)))
+
+
+def load_spec(name: str) -> Spec:
+    """A study of this package by name, or one in a TOML file.
+
+    Raises:
+      BadInput: there is no such study or file, or it cannot be read.
+    """
+    known = built_in()
+    if name in known:
+        return read_spec(tomllib.loads(known[name]))
+    path = Path(name)
+    if not path.is_file():
+        listed = ", ".join(known)
+        raise BadInput(f"study: no study or file {name!r} (known: {listed}){nearest(name, known)}")
+    try:
+        values = tomllib.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BadInput(f"study: cannot read {path}: {error}") from error
+    return read_spec({"name": path.stem, **values})
+
+
+def built_in() -> dict[str, str]:
+    """The studies of this package: `{name: text}`."""
+    folder = resources.files("sauna.study") / "studies"
+    return {
+        entry.name.removesuffix(".toml"): entry.read_text()
+        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name)
+        if entry.name.endswith(".toml")
+    }

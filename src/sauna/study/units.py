@@ -1,0 +1,121 @@
+"""A study's work in units: each is an ordinary run of a few seeds of one arm on one task.
+
+A unit's folder is named after its settings, so that studies which share settings share the work,
+and a study that is run again finds what is done.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sauna import rundir
+from sauna.study.spec import Arm, Spec
+
+SEEDS = 3  # per unit: members of one process share the cost of each vector step
+
+
+class Unit(NamedTuple):
+    """A run to be made.
+
+    Attributes:
+      name: of its folder.
+      settings: what the run is given, without the place and the source of drop rates.
+      source: the unit whose measured drop rates it repeats.
+    """
+
+    name: str
+    task: str
+    label: str
+    seeds: tuple[int, ...]
+    settings: dict[str, Any]
+    source: str | None
+
+    def run(self, folder: Path) -> Path:
+        """The run directory."""
+        return folder / self.name / "run"
+
+    def given(self, folder: Path) -> dict[str, Any]:
+        """Everything that the run is given."""
+        given = {**self.settings, "out": str(self.run(folder)), "processes": 1}
+        if self.source is not None:
+            given["drop_rate_from"] = str(folder / self.source / "run")
+        return given
+
+    def error(self, folder: Path) -> str | None:
+        """Why it failed for good, or None."""
+        path = folder / self.name / "failed.json"
+        return str(json.loads(path.read_text())["error"]) if path.is_file() else None
+
+    def is_complete(self, folder: Path) -> bool:
+        return rundir.is_complete(self.run(folder))
+
+
+def seeds_per_unit(spec: Spec, cores: int) -> int:
+    """As many as share a process well, or fewer where cores would stay idle."""
+    members = sum(len(arm.seeds) * len(arm.tasks) for arm in spec.arms)
+    return max(1, min(SEEDS, -(-members // cores)))
+
+
+def units_of(spec: Spec, size: int) -> list[Unit]:
+    """All units of `size` seeds at most, arm by arm, a source before those that repeat it."""
+    arms = {arm.label: arm for arm in spec.arms}
+    ordered = sorted(spec.arms, key=lambda arm: arm.rates_of is not None)
+    return [
+        _unit(arms, arm, task, seeds)
+        for arm in ordered
+        for task in arm.tasks
+        for seeds in _parts(arm, size)
+    ]
+
+
+def _parts(arm: Arm, size: int) -> Iterator[tuple[int, ...]]:
+    for first in range(0, len(arm.seeds), size):
+        yield arm.seeds[first : first + size]
+
+
+def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
+    source = _unit(arms, arms[arm.rates_of], task, seeds).name if arm.rates_of else None
+    settings = arm.given(task, seeds)
+    text = json.dumps([settings, source], sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    place = "".join(c if c.isalnum() or c in "-." else "-" for c in task)
+    name = f"{place}_{arm.arm}_{seeds[0]}-{seeds[-1]}_{digest}"
+    return Unit(name, task, arm.label, seeds, settings, source)
+
+
+def split(unit: Unit, folder: Path) -> list[Unit]:
+    """A unit of several seeds as units of one: so that the others go on where one failed."""
+    source_is_split = unit.source is not None and _is_split(folder / unit.source)
+    return [
+        unit._replace(
+            name=f"{unit.name}/seed-{seed}",
+            seeds=(seed,),
+            settings={**unit.settings, "seeds": [seed]},
+            source=f"{unit.source}/seed-{seed}" if source_is_split else unit.source,
+        )
+        for seed in unit.seeds
+    ]
+
+
+def mark_split(unit: Unit, folder: Path) -> None:
+    """Notes that the unit's seeds are trained one by one from now on."""
+    (folder / unit.name).mkdir(parents=True, exist_ok=True)
+    rundir.write_json(folder / unit.name / "split.json", {"seeds": list(unit.seeds)})
+
+
+def _is_split(place: Path) -> bool:
+    return (place / "split.json").exists()
+
+
+def parts(unit: Unit, folder: Path) -> list[Unit]:
+    """The units that hold the runs: the unit itself, or one per seed where it was split."""
+    return split(unit, folder) if _is_split(folder / unit.name) else [unit]
+
+
+def needs_split(unit: Unit, folder: Path) -> bool:
+    """Whether its source was split, so that it has to follow."""
+    return len(unit.seeds) > 1 and unit.source is not None and _is_split(folder / unit.source)

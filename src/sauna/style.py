@@ -1,0 +1,149 @@
+"""How every picture looks: the colour, line and marker of each label, and plain axes.
+
+Matplotlib is imported where it is used: most commands draw nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+# Okabe and Ito's palette, which the colour-blind can tell apart; an arm always has its colour.
+COLOURS = {
+    "ppo": "#0072B2",
+    "vex-head": "#E69F00",
+    "random-drop": "#999999",
+    "sauna": "#D55E00",
+    "sauna-paper": "#CC79A7",
+    "sauna-reference": "#009E73",
+}
+_OTHER_ARMS = ("#56B4E9", "#882255", "#997700", "#4B5563")
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X")  # matplotlib's names; one for each arm
+_DASHES: tuple[tuple[float, ...], ...] = ((), (6, 2.5), (1.5, 2), (8, 2.5, 1.5, 2.5))
+_SHADES = (0.0, 0.45, -0.45, 0.65)  # towards black on a light page, white where negative
+
+_RC: Any = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#8A8D91",
+    "axes.formatter.limits": (-4, 6),
+    "axes.grid": True,
+    "axes.labelsize": 9,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "font.size": 9,
+    "grid.color": "#E6E6E3",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "savefig.dpi": 130,
+    "svg.fonttype": "none",  # text stays text: small, and it can be searched
+    "svg.hashsalt": "sauna",  # ids of elements: the same in every run
+    "text.parse_math": False,  # a label is a name, also where it holds a dollar
+    "xtick.color": "#8A8D91",
+    "xtick.labelcolor": "#3D4044",
+    "xtick.labelsize": 8,
+    "ytick.color": "#8A8D91",
+    "ytick.labelcolor": "#3D4044",
+    "ytick.labelsize": 8,
+}
+# What a file would otherwise say of the day and the library's version.
+_METADATA: dict[str, dict[str, Any]] = {
+    ".png": {"Software": None},
+    ".svg": {"Date": None, "Creator": None},
+}
+
+
+class Look(NamedTuple):
+    """How one label is drawn: `dash` in points on and off, `marker` as matplotlib names it."""
+
+    colour: str
+    colour_on_dark: str
+    dash: tuple[float, ...]
+    marker: str
+
+
+def looks(arms: Mapping[str, str]) -> dict[str, Look]:
+    """`label -> Look`, no two alike, from `label -> arm` in the order of the study.
+
+    An arm's first label has the arm's own colour and a solid line; its further labels (say
+    `sauna 0.8`) have shades of it and other dashes and markers.
+    """
+    unknown = [arm for arm in dict.fromkeys(arms.values()) if arm not in COLOURS]
+    drawn: dict[str, int] = {}  # colour -> labels that have it so far
+    found = {}
+    for label in sorted(arms, key=lambda label: label != arms[label]):
+        arm = arms[label]
+        place = len(COLOURS) + unknown.index(arm) if arm in unknown else [*COLOURS].index(arm)
+        colour = COLOURS.get(arm) or _OTHER_ARMS[unknown.index(arm) % len(_OTHER_ARMS)]
+        number = drawn.get(colour, 0)
+        drawn[colour] = number + 1
+        shade = _SHADES[number % len(_SHADES)]
+        found[label] = Look(
+            colour=_mix(colour, shade),
+            colour_on_dark=_mix(colour, -shade),
+            # Moves on when the shades start again, so that the pair is a new one.
+            dash=_DASHES[(number + number // len(_SHADES)) % len(_DASHES)],
+            marker=_MARKERS[(place + number) % len(_MARKERS)],
+        )
+    return {label: found[label] for label in arms}
+
+
+def _mix(colour: str, share: float) -> str:
+    """`share` of the way to black, or to white where it is negative."""
+    target = 0 if share > 0 else 255
+    parts = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return "#" + "".join(f"{round(part + (target - part) * abs(share)):02X}" for part in parts)
+
+
+def short(value: float, position: object = None) -> str:
+    """`200000 -> 200k`, `1000000 -> 1M`: ticks of env steps."""
+    for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:g}{suffix}"
+    return f"{value:g}"
+
+
+def applied() -> AbstractContextManager[None]:
+    """Within it, matplotlib draws in this style."""
+    import matplotlib
+
+    return matplotlib.rc_context(_RC)
+
+
+def draw_line(
+    axes: Any, look: Look, x: Any, y: Any, low: Any, high: Any, *, label: str = ""
+) -> Any:
+    """A line with about eight markers and, where `low` and `high` are not NaN, its band."""
+    every = max(1, len(x) // 8)
+    first = 2 * len(axes.get_lines()) % every  # lines that lie on each other show both markers
+    axes.fill_between(x, low, high, color=look.colour, alpha=0.16, linewidth=0)
+    (line,) = axes.plot(
+        x,
+        y,
+        color=look.colour,
+        linestyle=(0, look.dash) if look.dash else "-",
+        linewidth=1.8,
+        marker=look.marker,
+        markersize=4,
+        markeredgewidth=0,
+        markevery=(first, every),
+        label=label,
+    )
+    return line
+
+
+def count_steps(axes: Any) -> None:
+    """The x axis counts env steps."""
+    axes.set_xlabel("env steps")
+    axes.xaxis.set_major_formatter(short)
+
+
+def save(figure: Any, path: Path) -> Path:
+    """Writes a picture whose bytes depend on what it shows alone."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata=_METADATA[path.suffix])
+    return path
