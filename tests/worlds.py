@@ -11,6 +11,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from sauna.envs.contract import episode_seed
+
 BOX = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
 
@@ -134,6 +136,15 @@ class Scripted(World):
 
     def truncated(self) -> bool:
         return self.cut and self.t >= self.end
+
+
+class Unlucky(Scripted):
+    """Raises in the fourth episode of the member with seed 1, and only there."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        if seed == episode_seed(1, 0, 3):
+            raise RuntimeError("out of luck")
+        return super().reset(seed=seed, options=options)
 
 
 class Forgetful(Scripted):

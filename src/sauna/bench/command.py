@@ -20,6 +20,7 @@ from sauna.bench.rates import WARM_UP, alternate, physics_rate, ratio, training_
 from sauna.presets import resolve
 from sauna.run import plain
 
+RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 
 
@@ -144,6 +145,8 @@ def report(result: Mapping[str, Any]) -> list[str]:
     lines.append(f"  one process, {total:.1f} us per env step:")
     for name, value in result["split"].items():
         lines.append(f"    {name:14} {value:6.2f} us  {value / total:5.1%}")
+    records = sum(result["split"][name] for name in RECORDS) / total
+    lines.append(f"  of it for records and safety ({', '.join(RECORDS)}): {records:.1%}")
     lines.append(
         f"  first env step after {result['seconds_to_first_env_step']:.1f} s, at most "
         f"{result['peak_memory_mib']:.0f} MiB in one process"

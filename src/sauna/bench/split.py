@@ -7,16 +7,20 @@ taken off again.
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 from sauna import training
+from sauna.checkpoint import save_checkpoint
 from sauna.collect.host import HostCollector
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
+from sauna.core.types import TrainState
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
 from sauna.metrics.rows import metrics_row
@@ -24,7 +28,7 @@ from sauna.presets import members, resolve
 from sauna.run import settle
 
 SECTIONS = ("physics", "environment", "normalisation", "inference", "filter", "bookkeeping",
-            "update", "logging")  # fmt: skip
+            "update", "checks", "logging", "checkpoints")  # fmt: skip
 ITERATIONS = 6
 
 
@@ -77,12 +81,14 @@ def split(settings: dict[str, Any], count: int) -> dict[str, float]:
     collector = HostCollector(program, found.spaces, envs, keys)
     restore = _wrap_host(collector, envs, timers)
     try:
-        steps, seconds = _train(job, program, collector, timers)
+        steps, seconds, states, counters = _train(job, program, collector, timers)
+        saving = _checkpoint_seconds(job, program, collector, states, counters)
     finally:
         restore()
         envs.close()
     rest = seconds - sum(timers.seconds.values()) - timers.calls * cost
     timers.seconds["bookkeeping"] += max(rest, 0.0)
+    timers.seconds["checkpoints"] = saving * ITERATIONS / config.checkpoint_every
     return {name: 1e6 * timers.seconds[name] / steps for name in SECTIONS}
 
 
@@ -113,6 +119,8 @@ def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
         moments.see = timers.wrap("normalisation", moments.see)
         moments.normalize = timers.wrap("normalisation", moments.normalize)
     envs.step = timers.wrap("environment", envs.step)
+    if hasattr(envs, "_is_finite"):
+        envs._is_finite = timers.wrap("checks", envs._is_finite)
     plain = mujoco.mj_step
     mujoco.mj_step = timers.wrap("physics", plain)
 
@@ -124,8 +132,8 @@ def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
 
 def _train(
     job: training.Job, program: Program, collector: HostCollector, timers: Timers
-) -> tuple[int, float]:
-    """Env steps and seconds of some iterations after two that are not counted."""
+) -> tuple[int, float, list[TrainState], list[Counters]]:
+    """Env steps and seconds of some iterations after two that are not counted; how they ended."""
     keys = [member_keys(member.seed) for member in job.members]
     states = [program.init(k.init) for k in keys]
     counters = [Counters() for _ in keys]
@@ -146,4 +154,24 @@ def _train(
             counters[p].add(collected[p])
             steps += collected[p].env_steps
             log(member, job.config, iteration, collected[p], counters[p], learned, hypers[p])
-    return steps, time.perf_counter() - clock
+    return steps, time.perf_counter() - clock, states, counters
+
+
+def _checkpoint_seconds(
+    job: training.Job,
+    program: Program,
+    collector: HostCollector,
+    states: list[TrainState],
+    counters: list[Counters],
+) -> float:
+    """Seconds that one checkpoint takes: gathering, hashing, writing, flushing to disk."""
+    seconds = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(3):
+            clock = time.perf_counter()
+            arrays = training._pack(
+                program, job.members, states, counters, collector, collector._envs
+            )
+            save_checkpoint(Path(folder), number, arrays, {}, keep=2)
+            seconds.append(time.perf_counter() - clock)
+    return sorted(seconds)[1]

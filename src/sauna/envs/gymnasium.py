@@ -159,7 +159,7 @@ class GymnasiumEnvs(HostEnvs):
 
     def _check_finite(self, active: np.ndarray) -> None:
         """One sum tells whether anything is amiss; only then the culprit is looked for."""
-        if math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum):
+        if self._is_finite():
             return
         for index in np.flatnonzero(active):
             slot = self._slots[index]
@@ -171,6 +171,9 @@ class GymnasiumEnvs(HostEnvs):
                     component = int(np.flatnonzero(~np.isfinite(row))[0])
                     value = row.reshape(-1)[component]
                     raise EnvironmentFailure(f"{where}: observation[{component}] is {value}")
+
+    def _is_finite(self) -> bool:
+        return math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum)
 
     def snapshot(self, index: int) -> Snapshot:
         slot = self._slots[index]

@@ -322,8 +322,7 @@ class MujocoEnvs(GymnasiumEnvs):
             if on:
                 slot.actions.append(row)
                 over = over or len(slot.actions) >= self._limit
-        rewards = self._reward.dot(self._zeros[: len(which)])
-        if self._flat.dot(self._zeros) != 0.0 or rewards != 0.0:
+        if not self._is_finite():
             self._check_finite(active)
         ended = over or True in self._terminated.tolist()
         if ended:
@@ -331,6 +330,10 @@ class MujocoEnvs(GymnasiumEnvs):
         else:
             self._truncated[:] = False
         return self._told(ended)
+
+    def _is_finite(self) -> bool:
+        rewards = self._reward.dot(self._zeros[: len(self._reward)])
+        return bool(self._flat.dot(self._zeros) == 0.0 and rewards == 0.0)
 
     def _end(self, active: np.ndarray) -> None:
         """Keeps the final observation of every ended episode and starts the next one."""

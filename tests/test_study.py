@@ -1,0 +1,229 @@
+"""Studies: what is trained, that nothing is trained twice, and that a failed seed is shown."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from helpers import SMALL
+from sauna import rundir
+from sauna.errors import BadInput
+from sauna.presets import ARMS
+from sauna.study.spec import built_in, check, load_spec, read_spec
+from sauna.study.summary import summarize
+from sauna.study.units import SEEDS, seeds_per_unit, units_of
+from test_cli import TESTS, sauna, small_flags
+
+TWO = {"tasks": ["A-v0"], "seeds": 6, "arms": [{"label": "ppo"}, {"label": "sauna"}]}
+QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"task": ["A"]}, "unknown key 'task'.*'tasks'"),
+        ({"threshhold": 1}, "unknown key 'threshhold'.*'threshold'"),
+        ({"out": "x"}, "unknown key 'out'"),
+        ({"arms": [{"label": "ppo", "thresold": 1}]}, "'thresold' in an arm.*'threshold'"),
+        ({"arms": [{"label": "suana"}]}, "unknown arm 'suana'.*'sauna'"),
+        ({"arms": [{"label": "ppo"}, {"label": "ppo"}]}, "'ppo' is given twice"),
+        ({"arms": []}, "no arms"),
+        ({"arms": [3]}, "list of tables"),
+        ({"tasks": "A"}, "tasks must be a list"),
+        ({"baseline": "poo"}, "no arm 'poo'.*'ppo'"),
+        ({"arms": [{"label": "ppo"}, {"label": "random-drop"}]}, "needs a filtered arm"),
+        ({"arms": [{"label": "sauna", "seeds": 2}, {"label": "random-drop"}]}, "every task and"),
+        ({"arms": [{"label": "ppo", "rates_of": "ppo"}]}, "read by random-drop only"),
+        ({"arms": [{"label": "x", "arm": "ppo", "threshold": 0.3}]}, "arm 'x': threshold: not re"),
+        ({"minibatches": 7}, "does not divide"),
+        ({"seeds": "0"}, "seeds: empty"),
+    ],
+)
+def test_mistakes_in_a_study_are_named(change: dict, message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        read_spec({**TWO, **change})
+
+
+def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('tasks = ["A-v0"]\nseeds = [4, 9]\nsteps = 1e5\n[[arms]]\nlabel = "ppo"\n')
+    spec = load_spec(str(path))
+    assert (spec.name, spec.arms[0].seeds, check(spec.arms[0], "A-v0").steps) == (
+        "mine", (4, 9), 100_000,
+    )  # fmt: skip
+    path.write_text("tasks = [")
+    with pytest.raises(BadInput, match="cannot read"):
+        load_spec(str(path))
+    with pytest.raises(BadInput, match="did you mean 'table1'"):
+        load_spec("table")
+
+
+@pytest.mark.parametrize("name", built_in())
+def test_studies_of_the_paper(name: str) -> None:
+    spec = load_spec(name)
+    assert spec.name == name and spec.baseline == "ppo"
+    arms = {arm.label: arm for arm in spec.arms}
+    for arm in spec.arms:
+        config = check(arm, spec.tasks[0])
+        assert config.steps == 10**6
+        # Only the filter may differ from the baseline: the same rules of truncation and budget.
+        if arm.baseline and not arm.label.startswith("ppo"):
+            base = check(arms[arm.baseline], spec.tasks[0])
+            assert config.truncation == base.truncation
+            assert config.budget == base.budget or "kept steps" in arm.label
+    assert {a.arm for a in spec.arms} <= set(ARMS)
+    if name == "fig3":
+        assert {a.arm for a in spec.arms} == set(ARMS)
+        assert {len(a.seeds) for a in spec.arms} == {6} and len(spec.tasks) == 6
+
+
+def test_units_share_folders_with_equal_settings_and_follow_their_source() -> None:
+    units = {u.name: u for u in units_of(load_spec("fig3"), SEEDS)}
+    again = {u.name for u in units_of(load_spec("table1"), SEEDS)}
+    assert again < set(units)
+    assert again == {u.name for u in units_of(load_spec("fig2"), SEEDS)}
+    seen: set[str] = set()
+    for name, unit in units.items():
+        assert len(unit.seeds) <= SEEDS
+        if unit.label == "random-drop":
+            assert unit.source in seen and units[unit.source].seeds == unit.seeds
+            assert units[unit.source].label == "sauna 0.8"
+        seen.add(name)
+    spec = read_spec({**TWO, "seeds": 4})
+    assert [seeds_per_unit(spec, cores) for cores in (1, 2, 4, 64)] == [3, 3, 2, 1]
+
+
+def rows_of(out: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted((out / "units").rglob("metrics.jsonl"))
+    }
+
+
+def folder_of(out: Path) -> Path:
+    (found,) = [p for p in out.iterdir() if p.name != "units"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("compared")
+    done = sauna("compare", "worlds:Scripted", "--out", str(out), *FLAGS)
+    assert done.returncode == 0, done.stderr
+    (out / "told.txt").write_text(done.stdout)
+    return out
+
+
+FLAGS = [*small_flags(seeds=4), "--processes=2"]
+
+
+def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) -> None:
+    told = (compared / "told.txt").read_text()
+    place = next(p for p in compared.iterdir() if p.name.startswith("compare_"))
+    results = json.loads((place / "results.json").read_text())
+    summary = json.loads((place / "summary.json").read_text())
+    assert summary == summarize(results)
+    assert [c["label"] for c in results["cells"]] == ["ppo", "vex-head", "random-drop", "sauna"]
+    for cell in results["cells"]:
+        assert [(m["seed"], m["status"]) for m in cell["members"]] == [
+            (seed, "complete") for seed in range(4)
+        ]
+        for member in cell["members"]:
+            assert 128 - 32 < member["env_steps"] <= 128
+            assert member["curve"]["env_steps"][-1] == member["env_steps"]
+    assert "too few seeds" in told and "report:" in told
+    assert (place / "report.html").read_text().count("too few seeds") >= 3
+    assert (place / "figures" / "learning_curves.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_random_drop_takes_the_rates_of_the_same_seeds(compared: Path) -> None:
+    rates: dict[tuple[str, int], list[float]] = {}
+    for path in (compared / "units").rglob("metrics.jsonl"):
+        for row in rundir.rows(path.parent):
+            rates.setdefault((row["arm"], row["seed"]), []).append(row["keep_rate"])
+    for path in (compared / "units").glob("*random-drop*/run/config.json"):
+        stored = json.loads(path.read_text())
+        for seed, given in zip(stored["config"]["seeds"], stored["drop_rates"], strict=True):
+            assert [1 - rate for rate in given] == pytest.approx(rates["sauna", seed])
+
+
+def test_running_again_repeats_nothing(compared: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in (compared / "units").rglob("*") if p.is_file()}
+    done = sauna("compare", "worlds:Scripted", "--out", str(compared), *FLAGS)
+    assert done.returncode == 0
+    assert {p: p.stat().st_mtime_ns for p in (compared / "units").rglob("*") if p.is_file()} == (
+        before
+    )
+
+
+def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp_path) -> None:
+    """SIGKILL leaves no orphan behind; SIGTERM saves and exits 143."""
+    command = [sys.executable, "-m", "sauna", "compare", "worlds:Scripted", "--out", str(tmp_path),
+               *FLAGS]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": TESTS}
+    for number, pause in ((signal.SIGKILL, 6.0), (signal.SIGTERM, 9.0)):
+        started = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        time.sleep(pause)
+        started.send_signal(number)
+        assert started.wait(60) in (-9, 143, 0)
+        wait_for_units(tmp_path)
+    done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
+    assert done.returncode == 0, done.stderr
+    expected = rows_of(compared)
+    got = rows_of(tmp_path)
+    assert expected.keys() == got.keys()
+    for name, rows in expected.items():
+        assert got[name] == rows, name
+
+
+def wait_for_units(out: Path) -> None:
+    """Until no process holds a run any more."""
+    deadline = time.monotonic() + 30
+    for path in (out / "units").rglob(".lock"):
+        while True:
+            try:
+                rundir.lock(path.parent).close()
+                break
+            except BadInput:
+                assert time.monotonic() < deadline, f"{path} is still held"
+                time.sleep(0.1)
+
+
+def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
+    """Seed 1 of every arm fails twice; its unit is split, and so is the one that repeats it."""
+    arms: list[dict[str, Any]] = [{"label": "sauna"}, {"label": "random-drop"}]
+    text = {"tasks": ["worlds:Unlucky"], "seeds": 3, "arms": arms, **QUICK}
+    lines = [f"{k} = {json.dumps(v)}" for k, v in text.items() if k != "arms"]
+    lines += [f"[[arms]]\nlabel = {json.dumps(arm['label'])}" for arm in arms]
+    (tmp_path / "unlucky.toml").write_text("\n".join(lines))
+    done = sauna("study", "unlucky.toml", "--out", "out", "--processes=2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "FAILED: worlds:Unlucky, sauna, seed 1" in done.stdout
+    results = json.loads((tmp_path / "out" / "unlucky" / "results.json").read_text())
+    sauna_cell, drop_cell = results["cells"]
+    assert [m["status"] for m in sauna_cell["members"]] == ["complete", "failed", "complete"]
+    assert [m["status"] for m in drop_cell["members"]] == ["complete", "failed", "complete"]
+    assert "out of luck" in sauna_cell["members"][1]["error"]
+    assert "drop rates" in drop_cell["members"][1]["error"]
+    table = json.loads((tmp_path / "out" / "unlucky" / "summary.json").read_text())["table"]
+    assert [(row["seeds"], row["failed"]) for row in table] == [(2, 1), (2, 1)]
+    page = (tmp_path / "out" / "unlucky" / "report.html").read_text()
+    assert "out of luck" in page
+    again = sauna("study", "unlucky.toml", "--out", "out", "--processes=2", cwd=tmp_path)
+    assert again.returncode == 0 and "FAILED" not in again.stdout
+
+
+def test_another_study_of_the_same_name_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    rundir.write_json(tmp_path / "one" / "study.json", {"study": {"x": 1}, "seeds_per_unit": 3})
+    (tmp_path / "one.toml").write_text('tasks = ["CartPole-v1"]\n[[arms]]\nlabel = "ppo"\n')
+    done = sauna("study", "one.toml", "--out", ".", cwd=tmp_path)
+    assert done.returncode == 2 and "another study of this name" in done.stderr
