@@ -82,6 +82,8 @@ def make_parser() -> argparse.ArgumentParser:
     bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")
     text = "iterations of each round's training (default 50)"
     bench.add_argument("--iterations", default="50", help=text)
+    text = "the rate against members, environments, width and processes instead"
+    bench.add_argument("--scale", action="store_true", help=text)
     bench.add_argument("--json", metavar="FILE", help="also write the figures there")
     _add_fields(bench, [n for n in FIELDS if n not in ("env", "steps", "out", "drop_rate_from")])
 
@@ -252,11 +254,16 @@ def _bench(values: dict[str, Any]) -> None:
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")
     given = {"arm": "ppo", "seeds": 6, **values}
-    del given["rounds"], given["iterations"]
-    from sauna.bench.command import bench, report
+    del given["rounds"], given["iterations"], given["scale"]
+    from sauna.bench.command import bench, bench_scale, report
 
-    result = bench(given, rounds=rounds, iterations=iterations, against=against, say=_say)
-    print("\n".join(report(result)))
+    if values["scale"]:
+        if against:
+            raise BadInput("against: not read with --scale")
+        result = bench_scale({"arm": "ppo", **given}, _say)
+    else:
+        result = bench(given, rounds=rounds, iterations=iterations, against=against, say=_say)
+        print("\n".join(report(result)))
     if file:
         Path(file).write_text(json.dumps(result, indent=1) + "\n")
         print(f"figures: {file}")

@@ -17,6 +17,7 @@ from typing import Any
 from sauna import rundir
 from sauna.bench.peers import peer_rate, prepare, versions
 from sauna.bench.rates import WARM_UP, alternate, physics_rate, ratio, training_rate
+from sauna.bench.scale import scale
 from sauna.presets import resolve
 from sauna.run import plain
 
@@ -81,6 +82,24 @@ def bench(
     result["split"] = _split_elsewhere({**given, "steps": batch * 100}, share)
     result |= start_and_memory(given)
     return result
+
+
+def bench_scale(given: Mapping[str, Any], say: Callable[[str], None]) -> dict[str, Any]:
+    """The rate against members, environments, width and processes, with the machine named.
+
+    Raises:
+      BadInput: the settings are not usable.
+    """
+    given = plain(given)
+    config = resolve(given)
+    return {
+        "env": config.env,
+        "arm": list(config.arm),
+        "machine": rundir.machine(),
+        "versions": rundir.versions(),
+        "git": rundir.git_revision(),
+        "scale": scale(given, say),
+    }
 
 
 def _has_physics(env: str) -> bool:
