@@ -1,7 +1,8 @@
 """Makes everything under `results/` and the tables and figures that are made of it.
 
-    python results/make.py           tables and figures from the result files
-    python results/make.py --train   trains first (hours), continuing where it stopped
+    python results/make.py             docs and figures from the result files
+    python results/make.py --collect   takes what the studies in runs/ have found so far, first
+    python results/make.py --train     trains first (many hours), continuing where it stopped
 
 The runs stay in `runs/`, which is not in the repository; what is committed is each member's final
 numbers and a thinned curve.
@@ -9,48 +10,25 @@ numbers and a thinned curve.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
+import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-import sauna
-from sauna import rundir
-from sauna.metrics.curve import interval
+from sauna.study.figures import write_figures
+from sauna.study.spec import load_spec
+from sauna.study.summary import summarize
+from sauna.study.tables import PAPER
 
 ROOT = Path(__file__).parent.parent
-TASKS = ["HalfCheetah-v5", "Hopper-v5", "InvertedDoublePendulum-v5", "InvertedPendulum-v5",
-         "Reacher-v5", "Swimmer-v5"]  # fmt: skip
-NAME = "ppo_mujoco"
-POINTS = 60  # of each member's curve that are kept
-
-
-class Training(NamedTuple):
-    """One run behind the numbers: 6 seeds of PPO on a task."""
-
-    task: str
-    run: str  # folder under runs/
-    truncation: str | None = None  # None: the default
-
-    def settings(self) -> dict[str, Any]:
-        common: dict[str, Any] = {"arm": "ppo", "preset": "mujoco", "seeds": 6, "steps": 1_000_000,
-                                  "processes": 2, "out": f"runs/{self.run}"}  # fmt: skip
-        return common | ({"truncation": self.truncation} if self.truncation else {})
-
-    def command(self) -> str:
-        flags = " ".join(f"--{name} {value}" for name, value in self.settings().items())
-        return f"sauna train {self.task} {flags}"
-
-
-TRAININGS = {task: Training(task, f"ppo-{task}") for task in TASKS}
-# A second look at one task, for which the treatment of the time limit decides.
-TRAININGS["InvertedDoublePendulum-v5, truncation=terminate"] = Training(
-    "InvertedDoublePendulum-v5", "idp-terminate", "terminate"
-)
+STUDIES = ("fig3", "cheetah30", "release")
+CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
+POINTS = 30  # of each curve that are committed
+SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8")  # in the README's figure
 
 # PPO's published means for 10^6 steps, for orientation. Other versions of the tasks and other
 # metrics: the paper's Table 1 and baselines on v2 tasks, CleanRL on v4 tasks.
@@ -64,110 +42,161 @@ PUBLISHED = {
 }
 
 
-def train(training: Training) -> None:
-    run = Path("runs") / training.run
-    if (run / "config.json").exists():
-        sauna.resume(run)
-    else:
-        sauna.train(training.task, **training.settings())
+def train(name: str) -> None:
+    command = [sys.executable, "-m", "sauna", "study", name, "--out", "runs"]
+    subprocess.run(command, check=True)
 
 
-def collect() -> None:
-    """Writes the final numbers and the thinned curves of all complete runs."""
-    results, curves = {}, []
-    for label, training in TRAININGS.items():
-        run = Path("runs") / training.run
-        if not rundir.is_complete(run):
-            raise SystemExit(f"{run} is not complete; train it with --train")
-        stored = rundir.read_config(run)
-        summary = json.loads((run / "summary.json").read_text())
-        results[label] = {
-            "command": training.command(),
-            "versions": stored["versions"],
-            "git": stored["git"],
-            "machine": stored["machine"],
-            "metric": summary["metric"],
-            "members": summary["members"],
-        }
-        for name in summary["members"]:
-            rows = [row for row in rundir.rows(run) if row["member"] == name]
-            rows = [row for row in rows if "return_mean" in row]
-            for i in np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int)):
-                row = rows[i]
-                explained = row.get("explained_variance")
-                curves.append([label, name, row["env_steps"], round(row["return_mean"], 3),
-                               "" if explained is None else round(explained, 4)])  # fmt: skip
-    (ROOT / "results" / f"{NAME}.json").write_text(json.dumps(results, indent=1) + "\n")
-    with (ROOT / "results" / f"{NAME}_curves.csv").open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["task", "member", "env_steps", "return_mean", "explained_variance"])
-        writer.writerows(curves)
+def collect(name: str) -> None:
+    """`results/NAME.json` from `runs/NAME`: finished members, thinned curves."""
+    source = ROOT / "runs" / name / "results.json"
+    if not source.exists():
+        return
+    results = json.loads(source.read_text())
+    results["cells"] = [cell for cell in map(_thinned, results["cells"]) if cell["members"]]
+    text = json.dumps(results, separators=(",", ":"))
+    (ROOT / "results" / f"{name}.json").write_text(text.replace('{"task"', '\n{"task"') + "\n")
 
 
-def table() -> str:
+def _thinned(cell: dict[str, Any]) -> dict[str, Any]:
+    members = [m for m in cell["members"] if m["status"] in ("complete", "failed")]
+    for member in members:
+        curve, number = member["curve"], len(member["curve"]["env_steps"])
+        chosen = np.unique(np.linspace(0, number - 1, POINTS).astype(int)).tolist()
+        member["curve"] = {key: [curve[key][i] for i in chosen] for key in ("env_steps", *CURVES)}
+    return {**cell, "members": members}
+
+
+def load(name: str) -> dict[str, Any] | None:
+    path = ROOT / "results" / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def ppo_table(results: dict[str, Any]) -> str:
     """PPO's final training returns as a Markdown table."""
-    tasks = json.loads((ROOT / "results" / f"{NAME}.json").read_text())
     lines = [
         "| task | PPO here, mean +- std | seeds, lowest to highest | paper (v2) | baselines (v2) | CleanRL (v4) |",  # noqa: E501
         "|---|---|---|---|---|---|",
     ]
-    for task, stored in tasks.items():
-        final = sorted(member["return_mean"] for member in stored["members"].values())
-        digits = 1 if abs(final[-1]) < 1000 else 0
-        seeds = ", ".join(f"{x:.{digits}f}" for x in final)
-        mean = f"{np.mean(final):.{digits}f} +- {np.std(final, ddof=1):.{digits}f}"
-        lines.append(f"| {task} | {mean} | {seeds} | {' | '.join(PUBLISHED[task.split(',')[0]])} |")
+    for cell in results["cells"]:
+        if cell["label"] in ("ppo", "ppo, limits end") and cell["members"]:
+            final = sorted(m["final_return"] for m in cell["members"] if m["final_return"])
+            digits = 1 if abs(final[-1]) < 1000 else 0
+            seeds = ", ".join(f"{x:.{digits}f}" for x in final)
+            mean = f"{np.mean(final):.{digits}f} +- {np.std(final, ddof=1):.{digits}f}"
+            task = cell["task"] + (", time limits end" if cell["label"] != "ppo" else "")
+            lines.append(f"| {task} | {mean} | {seeds} | {' | '.join(PUBLISHED[cell['task']])} |")
     return "\n".join(lines)
 
 
-def insert_table(path: Path) -> None:
-    """Puts the table between the markers of a Markdown file."""
-    begin, end = f"<!-- {NAME} begin -->", f"<!-- {NAME} end -->"
-    text = path.read_text()
-    head, rest = text.split(begin)
-    path.write_text(f"{head}{begin}\n{table()}\n{end}{rest.split(end)[1]}")
+def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> str:
+    """Every arm of a study as a Markdown table, the paper's numbers beside it."""
+    wanted = {(task, arm.label): len(arm.seeds) for arm in load_spec(name).arms
+              for task in arm.tasks}  # fmt: skip
+    lines = [
+        "| task | arm | seeds | final return, IQM [95%] | mean +- std | keep rate | against | P(better) [95%] | paper |",  # noqa: E501
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in summary["table"]:
+        seeds = f"{row['seeds']} of {wanted[row['task'], row['label']]}"
+        failed = f", {row['failed']} failed" if row["failed"] else ""
+        digits = 1 if abs(row["final_mean"] or 0) < 1000 else 0
+        std = "-" if row["final_std"] is None else f"{row['final_std']:.{digits}f}"
+        lines.append(
+            f"| {row['task']} | {row['label']} | {seeds}{failed} | "
+            f"{_interval(row['final_iqm'], digits)} | {row['final_mean']:.{digits}f} +- {std} | "
+            f"{row['keep_rate']:.3f} | {row['baseline'] or '-'} | "
+            f"{_interval(row['improvement'], 2)} | {_paper(row['task'], row['label'])} |"
+        )
+    return "\n".join(lines)
 
 
-def figure() -> None:
-    """`docs/ppo_mujoco.png` from the thinned curves."""
-    import matplotlib
+def _interval(values: list[float | None] | None, digits: int) -> str:
+    if values is None or values[0] is None:
+        return "-"
+    if values[1] is None:
+        return f"{values[0]:.{digits}f}"
+    return f"{values[0]:.{digits}f} [{values[1]:.{digits}f}, {values[2]:.{digits}f}]"
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
-    curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    with (ROOT / "results" / f"{NAME}_curves.csv").open() as file:
-        for row in csv.DictReader(file):
-            line = curves.setdefault(row["task"], {}).setdefault(row["member"], [])
-            line.append((float(row["env_steps"]), float(row["return_mean"])))
-    curves = {task: curves[task] for task in TASKS}
-    panels, axes = plt.subplots(2, 3, figsize=(10, 5.6), dpi=130)
-    for axis, (task, members) in zip(axes.flat, curves.items(), strict=True):
-        lines = [np.array(line) for line in members.values()]
-        grid = np.linspace(max(x[0, 0] for x in lines), min(x[-1, 0] for x in lines), 100)
-        values = np.stack([np.interp(grid, x[:, 0], x[:, 1]) for x in lines])
-        for x in lines:
-            axis.plot(x[:, 0], x[:, 1], color="#0072B2", alpha=0.3, linewidth=0.8)
-        axis.fill_between(grid, *interval(values), color="#0072B2", alpha=0.2, linewidth=0)
-        axis.plot(grid, values.mean(0), color="#0072B2", linewidth=2)
-        axis.set_title(task, fontsize=10)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.ticklabel_format(axis="x", style="sci", scilimits=(0, 4))
-    panels.supxlabel("env steps", fontsize=10)
-    panels.supylabel("training return (last 100 episodes)", fontsize=10)
-    panels.suptitle("PPO, preset mujoco: 6 seeds, their mean and its 95% interval", fontsize=11)
-    panels.tight_layout()
-    panels.savefig(ROOT / "docs" / f"{NAME}.png")
+def _paper(task: str, label: str) -> str:
+    """The paper's Table 1, beside its PPO and beside the variants of its method."""
+    known = PAPER.get(task.rpartition("-v")[0], {})
+    column = "PPO" if label.startswith("ppo") else "SAUNA" if label.startswith("sauna") else ""
+    return f"{known[column][0]} +- {known[column][1]}" if column in known else "-"
+
+
+def document() -> str:
+    """`docs/results.md`, all of it from the result files."""
+    parts = [
+        "# What was found",
+        "Made by `python results/make.py` from the files in `results/`; trained by "
+        "`python results/make.py --train`. Training return (sampled actions), mean of the last "
+        "100 episodes; 10^6 env steps unless an arm says otherwise. The paper's numbers are of "
+        "version 2 of the tasks and of kept steps: compare arms within a column, not across.",
+        "A verdict needs an exact Mann-Whitney test, corrected by Holm's method for the arms of a "
+        "task, and an interval of P(better) that leaves out one half. It is not corrected for the "
+        "number of tasks. The interval of an IQM is a percentile bootstrap, which is too narrow "
+        "with six seeds (it covers about 91% of the time rather than 95%).",
+    ]
+    for name in STUDIES:
+        results = load(name)
+        if results is None:
+            parts.append(f"## {name}\n\nNot trained yet: `sauna study {name}`.")
+            continue
+        summary = summarize(results)
+        parts += [f"## {name}", f"`{results['command']}`", arms_table(name, results, summary)]
+        parts.append(_missing(name, results))
+        parts.append("\n".join(f"- {verdict['text']}" for verdict in summary["verdicts"]))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _missing(name: str, results: dict[str, Any]) -> str:
+    """What of a study is not trained yet."""
+    done = {
+        (c["task"], c["label"]): sum(m["status"] == "complete" for m in c["members"])
+        for c in results["cells"]
+    }
+    missing = [
+        f"{arm.label} on {task} ({len(arm.seeds) - done.get((task, arm.label), 0)} seeds)"
+        for arm in load_spec(name).arms
+        for task in arm.tasks
+        if done.get((task, arm.label), 0) < len(arm.seeds)
+    ]
+    return f"Not trained to the end yet: {'; '.join(missing)}." if missing else ""
+
+
+def insert(path: Path, name: str, text: str) -> None:
+    """Puts `text` between the markers `NAME` of a Markdown file."""
+    begin, end = f"<!-- {name} begin -->", f"<!-- {name} end -->"
+    whole = path.read_text()
+    head, rest = whole.split(begin)
+    path.write_text(f"{head}{begin}\n{text}\n{end}{rest.split(end)[1]}")
+
+
+def figures(name: str, results: dict[str, Any]) -> None:
+    """The README's picture: learning curves of the arms that decide."""
+    chosen = [cell for cell in results["cells"] if cell["label"] in SHOWN]
+    shown = {**results, "cells": chosen}
+    drawn = write_figures(shown, summarize(shown), ROOT / "docs" / name)
+    for path in (ROOT / "docs" / name / "figures").iterdir():
+        if path.suffix == ".svg":
+            path.unlink()
+    assert drawn
 
 
 def main() -> None:
     os.chdir(ROOT)
-    if "--train" in sys.argv:
-        for training in TRAININGS.values():
-            train(training)
-        collect()
-    insert_table(ROOT / "README.md")
-    figure()
+    for name in STUDIES:
+        if "--train" in sys.argv:
+            train(name)
+        if "--train" in sys.argv or "--collect" in sys.argv:
+            collect(name)
+    (ROOT / "docs" / "results.md").write_text(document())
+    results = load("fig3")
+    if results is not None:
+        insert(ROOT / "README.md", "ppo", ppo_table(results))
+        figures("fig3", results)
 
 
 if __name__ == "__main__":

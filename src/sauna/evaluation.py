@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import json
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -158,7 +159,10 @@ def film(
     path.parent.mkdir(exist_ok=True)
     rate = int(world.metadata.get("render_fps", 30))
     world.close()
-    imageio.imwrite(path, np.stack(frames), fps=rate, macro_block_size=1)
+    with warnings.catch_warnings():
+        # ffmpeg is started by a fork that executes it at once; JAX warns of forks of any kind.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        imageio.imwrite(path, np.stack(frames), fps=rate, macro_block_size=1)
     return path
 
 

@@ -22,7 +22,7 @@ from sauna.config import Config
 from sauna.errors import Interrupted, SaunaError
 from sauna.presets import Member
 
-SHOWN = ("seed", "env_steps", "return_mean", "keep_rate")
+SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate")
 
 
 class LineDisplay:

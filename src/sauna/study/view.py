@@ -20,17 +20,14 @@ class StudyView:
 
     def __init__(self, spec: Spec, units: list[Unit], folder: Path) -> None:
         self._units = units
-        self._budget = {
-            (arm.label, task): check(arm, task).steps for arm in spec.arms for task in arm.tasks
-        }
-        self._counts = {
-            (arm.label, task): check(arm, task).budget for arm in spec.arms for task in arm.tasks
+        self._configs = {
+            (arm.label, task): check(arm, task) for arm in spec.arms for task in arm.tasks
         }
         self._same: dict[str, list[tuple[str, str]]] = {}  # a unit may serve several labels
         self._latest: dict[tuple[str, str], dict[int, dict[str, Any]]] = {
-            key: {} for key in self._budget
+            key: {} for key in self._configs
         }
-        self._failed: dict[tuple[str, str], set[int]] = {key: set() for key in self._budget}
+        self._failed: dict[tuple[str, str], set[int]] = {key: set() for key in self._configs}
         for unit in units:
             self._same.setdefault(unit.name, []).append((unit.label, unit.task))
             for part in parts(unit, folder):
@@ -44,17 +41,21 @@ class StudyView:
 
     def _done(self) -> float:
         """Members' worth of work that is done."""
-        total = 0.0
-        for key, members in self._latest.items():
-            for seed, row in members.items():
-                if seed not in self._failed[key]:
-                    total += min(row[self._unit_of(key)] / self._budget[key], 1.0)
-            total += len(self._failed[key])
-        return total
+        return sum(
+            len(self._failed[key])
+            + sum(
+                self._share(key, row)
+                for seed, row in members.items()
+                if seed not in self._failed[key]
+            )
+            for key, members in self._latest.items()
+        )
 
-    def _unit_of(self, key: tuple[str, str]) -> str:
-        # Progress lines hold env steps only; of a budget of kept steps they are nearly the same.
-        return "env_steps"
+    def _share(self, key: tuple[str, str], row: dict[str, Any]) -> float:
+        """How much of its budget a member has used, of what it can use."""
+        config = self._configs[key]
+        batch = config.rollout_steps * config.envs
+        return float(min(row[f"{config.budget}_steps"] / (config.steps // batch * batch), 1.0))
 
     def open(self) -> None:
         if sys.stdout.isatty():
@@ -110,7 +111,7 @@ class StudyView:
         text = f"{done / members:.1%} of {members} members"
         if done > before and spent > 5:
             per_second = (done - before) / spent
-            steps = sum(self._budget.values()) / len(self._budget)
+            steps = sum(c.steps for c in self._configs.values()) / len(self._configs)
             left = duration((members - done) / per_second)
             text += f", {per_second * steps:,.0f} env steps/s, {left} left"
         failed = sum(map(len, self._failed.values()))
@@ -126,9 +127,9 @@ class StudyView:
             table.add_column(column, justify="right")
         for (label, task), members in self._latest.items():
             seeds = sum(len(u.seeds) for u in self._units if (u.label, u.task) == (label, task))
-            budget, rows = self._budget[label, task], list(members.values())
-            share = sum(min(row["env_steps"] / budget, 1.0) for row in rows) / seeds
-            ended = sum(row["env_steps"] > 0.99 * budget for row in rows)
+            rows = list(members.values())
+            shares = [self._share((label, task), row) for row in rows]
+            share, ended = sum(shares) / seeds, sum(share > 0.99 for share in shares)
             means = {
                 name: sum(row[name] for row in rows) / len(rows)
                 for name in ("return_mean", "keep_rate")

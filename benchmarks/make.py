@@ -1,0 +1,116 @@
+"""Makes the tables of speed and the figure of scale from `benchmarks/results/`.
+
+python benchmarks/make.py            tables and figure from the result files
+python benchmarks/make.py --measure  measures first (about half an hour on an idle machine)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from sauna.bench.scale import draw
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+MEASURED = {
+    "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "5"],
+    "hopper_6": ["Hopper-v5", "--rounds", "5", "--iterations", "25"],
+    "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "5"],
+    "cheetah_6_sauna": ["HalfCheetah-v5", "--arm", "sauna", "--threshold", "0.8", "--rounds", "5"],
+}  # fmt: skip
+
+
+def measure() -> None:
+    for name, flags in MEASURED.items():
+        file = str(RESULTS / f"{name}.json")
+        subprocess.run([sys.executable, "-m", "sauna", "bench", *flags, "--json", file], check=True)
+    file = str(RESULTS / "scale.json")
+    subprocess.run([sys.executable, "-m", "sauna", "bench", "--scale", "--json", file], check=True)
+
+
+def stored() -> dict[str, dict[str, Any]]:
+    return {
+        name: json.loads(path.read_text())
+        for name in MEASURED
+        if (path := RESULTS / f"{name}.json").exists()
+    }
+
+
+def rates_table(found: dict[str, dict[str, Any]]) -> str:
+    lines = [
+        "| | env steps/s, in sum | of raw `mj_step` | of Stable-Baselines3 | first env step | memory of a process |",  # noqa: E501
+        "|---|---|---|---|---|---|",
+    ]
+    for one in found.values():
+        rates = sorted(one["rates"]["training"])
+        what = f"{one['env']}, {', '.join(one['arm'])}, {one['members']} "
+        what += "seed" if one["members"] == 1 else "seeds"
+        what += f", {one['processes']} process" + ("es" if one["processes"] > 1 else "")
+        lines.append(
+            f"| {what} | {rates[len(rates) // 2]:,.0f} | {_ratio(one, 'physics')} | "
+            f"{_ratio(one, 'sb3')} | {one['seconds_to_first_env_step']:.1f} s | "
+            f"{one['peak_memory_mib']:.0f} MiB |"
+        )
+    return "\n".join(lines)
+
+
+def _ratio(one: dict[str, Any], name: str) -> str:
+    ratio = one["ratios"].get(name)
+    if ratio is None:
+        return "-"
+    return f"{ratio['median']:.2f} ({ratio['low']:.2f} to {ratio['high']:.2f})"
+
+
+def split_table(found: dict[str, dict[str, Any]]) -> str:
+    names = list(next(iter(found.values()))["split"])
+    head = [f"{one['env']}, {', '.join(one['arm'])}, {one['members']}" for one in found.values()]
+    lines = [f"| us per env step | {' | '.join(head)} |", "|---|" + "---|" * len(head)]
+    for name in names:
+        values = [f"{one['split'][name]:.2f}" for one in found.values()]
+        lines.append(f"| {name} | {' | '.join(values)} |")
+    totals = [f"{sum(one['split'].values()):.2f}" for one in found.values()]
+    return "\n".join([*lines, f"| all | {' | '.join(totals)} |"])
+
+
+def scale_table(result: dict[str, Any]) -> str:
+    lines = ["| | value: 1000 env steps/s, in sum |", "|---|---|"]
+    for axis, points in result["scale"].items():
+        shown = ", ".join(f"{p['value']}: {p['rate'] / 1000:.1f}" for p in points)
+        lines.append(f"| {axis} | {shown} |")
+    return "\n".join(lines)
+
+
+def insert(path: Path, name: str, text: str) -> None:
+    """Puts `text` between the markers `NAME` of a Markdown file."""
+    begin, end = f"<!-- {name} begin -->", f"<!-- {name} end -->"
+    whole = path.read_text()
+    head, rest = whole.split(begin)
+    path.write_text(f"{head}{begin}\n{text}\n{end}{rest.split(end)[1]}")
+
+
+def main() -> None:
+    os.chdir(ROOT)
+    if "--measure" in sys.argv:
+        measure()
+    found = stored()
+    insert(ROOT / "README.md", "speed", rates_table(found))
+    page = ROOT / "docs" / "performance.md"
+    machine = next(iter(found.values()))["machine"]
+    text = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
+    insert(page, "machine", f"Measured on: {text}.")
+    insert(page, "rates", rates_table(found))
+    insert(page, "split", split_table(found))
+    scaled = RESULTS / "scale.json"
+    if scaled.exists():
+        result = json.loads(scaled.read_text())
+        insert(page, "scale", scale_table(result))
+        draw(result["scale"], f"{result['env']}, PPO, whole training", ROOT / "docs" / "scale.png")
+
+
+if __name__ == "__main__":
+    main()
