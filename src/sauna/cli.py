@@ -78,7 +78,9 @@ def make_parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
     bench.add_argument("env", nargs="?", metavar="ENV", default="HalfCheetah-v5",
                        help="default: HalfCheetah-v5")  # fmt: skip
-    bench.add_argument("--against", metavar="PEER", help="also run another trainer: sb3")
+    bench.add_argument("--against", metavar="PEER", help="also run another trainer: sb3, cleanrl")
+    text = "with --against cleanrl: your copy of its ppo_continuous_action.py"
+    bench.add_argument("--script", metavar="FILE", help=text)
     bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")
     text = "iterations of each round's training (default 50)"
     bench.add_argument("--iterations", default="50", help=text)
@@ -254,7 +256,11 @@ def _bench(values: dict[str, Any]) -> None:
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")
     given = {"arm": "ppo", "seeds": 6, **values}
-    del given["rounds"], given["iterations"], given["scale"]
+    script = values["script"]
+    if (against == "cleanrl") != bool(script) or (script and not Path(script).is_file()):
+        raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
+    for name in ("rounds", "iterations", "scale", "script"):
+        del given[name]
     from sauna.bench.command import bench, bench_scale, report
 
     if values["scale"]:
@@ -262,7 +268,8 @@ def _bench(values: dict[str, Any]) -> None:
             raise BadInput("against: not read with --scale")
         result = bench_scale({"arm": "ppo", **given}, _say)
     else:
-        result = bench(given, rounds=rounds, iterations=iterations, against=against, say=_say)
+        result = bench(given, rounds=rounds, iterations=iterations, against=against,
+                       script=Path(script) if script else None, say=_say)  # fmt: skip
         print("\n".join(report(result)))
     if file:
         Path(file).write_text(json.dumps(result, indent=1) + "\n")

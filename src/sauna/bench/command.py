@@ -31,6 +31,7 @@ def bench(
     iterations: int,
     rounds: int,
     against: str | None,
+    script: Path | None,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Measures training with the settings `given` on this machine.
@@ -38,7 +39,7 @@ def bench(
     Args:
       iterations: of each round's training, beyond the warm-up.
       rounds: how often everything is measured, in turn.
-      against: a peer, or None.
+      against: a peer, or None; script: the file that the peer `cleanrl` is.
       say: is told of each figure.
 
     Returns:
@@ -69,7 +70,7 @@ def bench(
     }
     if against:
         python = prepare(against, say)
-        measures[against] = partial(peer_rate, python, config.env, processes, SECONDS)
+        measures[against] = partial(peer_rate, python, script, config.env, processes, SECONDS)
         result["peer"] = {"name": against, "processes": processes, "versions": versions(python)}
     result["rates"] = rates = alternate(measures, rounds, say)
     result["ratios"] = {

@@ -10,19 +10,26 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
+import time
 import venv
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from sauna.errors import BadInput, SaunaError
 
-PEERS = ("sb3",)
+# What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy.
+PEERS = {
+    "sb3": ["stable-baselines3==2.9.2", "gymnasium[mujoco]"],
+    "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
+}
 # CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
 _TORCH = (
     ["torch", "--index-url", "https://download.pytorch.org/whl/cpu"],
     ["torch==2.13.0"],
 )
-_SB3 = ["stable-baselines3==2.9.2", "gymnasium[mujoco]"]
 
 
 def cache_folder() -> Path:
@@ -42,13 +49,13 @@ def prepare(peer: str, say: Callable[[str], None]) -> Path:
     folder = cache_folder() / "peers" / peer
     python = folder / "bin" / "python"
     if not (folder / "complete").exists():
-        say(f"installing Stable-Baselines3 and PyTorch (CPU) into {folder}, once")
+        say(f"installing {PEERS[peer][0]} and PyTorch (CPU) into {folder}, once")
         venv.create(folder, with_pip=True, clear=True)
         for attempt in _TORCH:
             failed = _pip(python, attempt)
             if failed is None:
                 break
-        failed = failed or _pip(python, _SB3)
+        failed = failed or _pip(python, PEERS[peer])
         if failed is not None:
             raise SaunaError(f"against: {peer} cannot be installed: {failed}")
         (folder / "complete").touch()
@@ -63,40 +70,70 @@ def _pip(python: Path, arguments: list[str]) -> str | None:
     return None if done.returncode == 0 else lines[-1]
 
 
-def peer_rate(python: Path, env: str, processes: int, seconds: float) -> float:
+def peer_rate(python: Path, script: Path | None, env: str, processes: int, seconds: float) -> float:
     """Env steps per second, summed over `processes` trainings that run at the same time.
+
+    Args:
+      script: CleanRL's `ppo_continuous_action.py`, or None for Stable-Baselines3.
 
     Raises:
       SaunaError: one of them failed; its last line says why.
     """
-    script = Path(__file__).with_name("peer_sb3.py")
+    measure = _sb3 if script is None else partial(_cleanrl, script)
+    with ThreadPoolExecutor(processes) as pool:
+        rates = pool.map(lambda seed: measure(python, env, seed, seconds), range(processes))
+        return sum(rates)
+
+
+def _variables() -> dict[str, str]:
     variables = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
     variables.pop("PYTHONPATH", None)
-    started = [
-        subprocess.Popen(
-            [str(python), str(script), env, str(seed), str(seconds)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=variables,
-        )
-        for seed in range(processes)
-    ]
-    rate = 0.0
-    for process in started:
-        out, err = process.communicate()
-        if process.returncode:
-            lines = err.strip().splitlines() or [f"exit code {process.returncode}"]
-            raise SaunaError(f"against: the peer failed: {lines[-1]}")
-        rate += json.loads(out.splitlines()[-1])["rate"]
-    return rate
+    return variables
+
+
+def _sb3(python: Path, env: str, seed: int, seconds: float) -> float:
+    script = Path(__file__).with_name("peer_sb3.py")
+    command = [str(python), str(script), env, str(seed), str(seconds)]
+    done = subprocess.run(command, capture_output=True, text=True, env=_variables())
+    if done.returncode:
+        raise _failed(done.stderr, done.returncode)
+    return float(json.loads(done.stdout.splitlines()[-1])["rate"])
+
+
+def _cleanrl(script: Path, python: Path, env: str, seed: int, seconds: float) -> float:
+    """The script prints a line after each update; the first two are not counted."""
+    command = [str(python), "-u", str(script.resolve()), "--env-id", env, "--seed", str(seed)]
+    seen: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+            env=_variables(),
+        )  # fmt: skip
+        assert process.stdout is not None and process.stderr is not None
+        for line in process.stdout:
+            if line.startswith("SPS:"):
+                seen.append(time.perf_counter())
+                if len(seen) >= 5 and seen[-1] - seen[2] > seconds:
+                    break
+        process.kill()
+        errors = process.stderr.read()
+        process.wait()
+    if len(seen) < 4:
+        raise _failed(errors, process.returncode)
+    return 2048 * (len(seen) - 3) / (seen[-1] - seen[2])
+
+
+def _failed(errors: str, code: int) -> SaunaError:
+    lines = errors.strip().splitlines() or [f"exit code {code}"]
+    return SaunaError(f"against: the peer failed: {lines[-1]}")
 
 
 def versions(python: Path) -> dict[str, str]:
     """Of what a peer's speed depends on."""
-    names = ("stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
-    code = ("import importlib.metadata as m, json, sys; "
-            "print(json.dumps({n: m.version(n) for n in sys.argv[1:]}))")  # fmt: skip
-    command = [str(python), "-c", code, *names]
+    code = ("import importlib.metadata as m, json; "
+            "names = {d.name for d in m.distributions()}; "
+            "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'numpy'); "
+            "print(json.dumps({n: m.version(n) for n in wanted if n in names}))")  # fmt: skip
+    command = [str(python), "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return {"python": sys.version.split()[0], **json.loads(done.stdout)}
