@@ -20,9 +20,11 @@ from typing import Any
 import numpy as np
 
 from sauna.study.figures import write_figures
+from sauna.study.results import gather
 from sauna.study.spec import load_spec
 from sauna.study.summary import summarize
 from sauna.study.tables import PAPER
+from sauna.study.units import units_of
 
 ROOT = Path(__file__).parent.parent
 STUDIES = ("fig3", "cheetah30", "release")
@@ -48,12 +50,19 @@ def train(name: str) -> None:
 
 
 def collect(name: str) -> None:
-    """`results/NAME.json` from `runs/NAME`: finished members, thinned curves."""
-    source = ROOT / "runs" / name / "results.json"
-    if not source.exists():
+    """`results/NAME.json` from what `runs/` holds of the study: finished members, thinned curves.
+
+    The study may still be running, or have been interrupted.
+    """
+    stored = ROOT / "runs" / name / "study.json"
+    if not stored.exists():
         return
-    results = json.loads(source.read_text())
+    spec, size = load_spec(name), json.loads(stored.read_text())["seeds_per_unit"]
+    folder = ROOT / "runs" / "units"
+    results = gather(spec, units_of(spec, size), folder, f"sauna study {name}")
     results["cells"] = [cell for cell in map(_thinned, results["cells"]) if cell["members"]]
+    for cell in results["cells"]:
+        del cell["config"]  # the command says what differs from the preset
     text = json.dumps(results, separators=(",", ":"))
     (ROOT / "results" / f"{name}.json").write_text(text.replace('{"task"', '\n{"task"') + "\n")
 
@@ -157,12 +166,12 @@ def _missing(name: str, results: dict[str, Any]) -> str:
         (c["task"], c["label"]): sum(m["status"] == "complete" for m in c["members"])
         for c in results["cells"]
     }
-    missing = [
-        f"{arm.label} on {task} ({len(arm.seeds) - done.get((task, arm.label), 0)} seeds)"
-        for arm in load_spec(name).arms
-        for task in arm.tasks
-        if done.get((task, arm.label), 0) < len(arm.seeds)
-    ]
+    missing = []
+    for arm in load_spec(name).arms:
+        tasks = [t for t in arm.tasks if done.get((t, arm.label), 0) < len(arm.seeds)]
+        if tasks:
+            every = len(tasks) == len(arm.tasks) > 1
+            missing.append(f"{arm.label} ({'every task' if every else ', '.join(tasks)})")
     return f"Not trained to the end yet: {'; '.join(missing)}." if missing else ""
 
 
@@ -180,7 +189,7 @@ def figures(name: str, results: dict[str, Any]) -> None:
     shown = {**results, "cells": chosen}
     drawn = write_figures(shown, summarize(shown), ROOT / "docs" / name)
     for path in (ROOT / "docs" / name / "figures").iterdir():
-        if path.suffix == ".svg":
+        if path.name not in ("learning_curves.png", "keep_rate.png"):
             path.unlink()
     assert drawn
 
