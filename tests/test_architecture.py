@@ -18,16 +18,9 @@ ALLOWED = {
     "metrics": {"presets", "rundir", "collect", "core", "member_state", "style"},
     "study": {"presets", "rundir", "run", "style", "envs.probe", "metrics.display"},
     "bench": {
-        "presets",
-        "rundir",
-        "run",
-        "training",
-        "core",
-        "collect",
-        "envs",
-        "metrics.rows",
-        "member_state",
-    },
+        "checkpoint", "collect", "core", "envs", "member_state", "metrics.rows", "presets", "run",
+        "rundir", "style", "training",
+    },  # fmt: skip
 }
 
 

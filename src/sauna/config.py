@@ -78,12 +78,9 @@ class Config:
         at_least=0,
         shapes_program=False,
     )
-    backend: str = option(
-        "auto",
-        "what steps the environments (auto: a fast path with the same bits where there is one)",
-        choices=("auto", "gymnasium"),
-        shapes_program=False,
-    )
+    backend: str = option("auto", "what steps the environments (auto: a fast path with the same "
+                          "bits where there is one)", choices=("auto", "gymnasium"),
+                          shapes_program=False)  # fmt: skip
     env_timeout: float = option(
         60.0, "seconds to wait for an environment worker", above=0, shapes_program=False
     )
@@ -298,7 +295,7 @@ _READERS: dict[str, tuple[str, Any]] = {
     "threshold": ("a filter other than none and random-drop",
                   lambda c: c.filter not in ("none", "random-drop")),
     "history": ("filter sauna", lambda c: c.filter == "sauna"),
-    "decision": ("filter sauna", lambda c: c.filter == "sauna"),
+    "decision": ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1),
     "dropped": ("a filter", lambda c: c.filter != "none"),
     "max_env_steps_factor": ("a filter with dropped=replace",
                              lambda c: c.filter != "none" and c.dropped == "replace"),
