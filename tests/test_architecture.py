@@ -18,9 +18,18 @@ ALLOWED = {
     "metrics": {"presets", "rundir", "collect", "core", "member_state", "style"},
     "study": {"presets", "rundir", "run", "style", "envs.probe", "metrics.display"},
     "bench": {
-        "checkpoint", "collect", "core", "envs", "member_state", "metrics.rows", "presets", "run",
-        "rundir", "style", "training",
-    },  # fmt: skip
+        "checkpoint",
+        "collect",
+        "core",
+        "envs",
+        "member_state",
+        "metrics.rows",
+        "presets",
+        "run",
+        "rundir",
+        "style",
+        "training",
+    },
 }
 
 
