@@ -10,40 +10,78 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sauna import rundir
+from sauna.bench.rates import alternate, ratio, training_rate
 from sauna.bench.scale import draw
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = {
-    "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "5"],
-    "hopper_6": ["Hopper-v5", "--rounds", "5", "--iterations", "25"],
-    "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "5"],
-    "cheetah_6_sauna": ["HalfCheetah-v5", "--arm", "sauna", "--threshold", "0.8", "--rounds", "5"],
-}  # fmt: skip
+    "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "3"],
+    "hopper_6": ["Hopper-v5", "--rounds", "3", "--iterations", "25"],
+    "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "3"],
+}
+# Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
+# --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
+BY_HAND = ["cheetah_1_cleanrl"]
+NAMES = {"sb3": "Stable-Baselines3", "cleanrl": "CleanRL's script"}
+FILTERED = {
+    "ppo": {"arm": "ppo"},
+    "sauna, threshold 0.8": {"arm": "sauna", "threshold": 0.8},
+    "sauna-reference": {"arm": "sauna-reference", "budget": "env"},
+}
 
 
 def measure() -> None:
     for name, flags in MEASURED.items():
         file = str(RESULTS / f"{name}.json")
         subprocess.run([sys.executable, "-m", "sauna", "bench", *flags, "--json", file], check=True)
+    measure_filtered()
     file = str(RESULTS / "scale.json")
     subprocess.run([sys.executable, "-m", "sauna", "bench", "--scale", "--json", file], check=True)
+
+
+def measure_filtered() -> None:
+    """Filtered arms against PPO, in turn, per env step."""
+    common = {"env": "HalfCheetah-v5", "seeds": 6, "steps": 6 * 51_200}
+    arms = {
+        name: partial(training_rate, {**common, **settings}) for name, settings in FILTERED.items()
+    }
+    rates = alternate(arms, rounds=5, say=print)
+    result = {
+        **common,
+        "machine": rundir.machine(),
+        "versions": rundir.versions(),
+        "rates": rates,
+        "of_ppo": {name: ratio(found, rates["ppo"]) for name, found in rates.items()},
+    }
+    (RESULTS / "filtered.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+def filtered_table(result: dict[str, Any]) -> str:
+    lines = ["| arm | env steps/s, in sum | of PPO's |", "|---|---|---|"]
+    for name, ratio_ in result["of_ppo"].items():
+        rates = sorted(result["rates"][name])
+        shown = f"{ratio_['median']:.2f} ({ratio_['low']:.2f} to {ratio_['high']:.2f})"
+        lines.append(f"| {name} | {rates[len(rates) // 2]:,.0f} | {shown} |")
+    return "\n".join(lines)
 
 
 def stored() -> dict[str, dict[str, Any]]:
     return {
         name: json.loads(path.read_text())
-        for name in MEASURED
+        for name in [*MEASURED, *BY_HAND]
         if (path := RESULTS / f"{name}.json").exists()
     }
 
 
 def rates_table(found: dict[str, dict[str, Any]]) -> str:
     lines = [
-        "| | env steps/s, in sum | of raw `mj_step` | of Stable-Baselines3 | first env step | memory of a process |",  # noqa: E501
+        "| | env steps/s, in sum | of raw `mj_step` | of another trainer | first env step | memory of a process |",  # noqa: E501
         "|---|---|---|---|---|---|",
     ]
     for one in found.values():
@@ -53,10 +91,16 @@ def rates_table(found: dict[str, dict[str, Any]]) -> str:
         what += f", {one['processes']} process" + ("es" if one["processes"] > 1 else "")
         lines.append(
             f"| {what} | {rates[len(rates) // 2]:,.0f} | {_ratio(one, 'physics')} | "
-            f"{_ratio(one, 'sb3')} | {one['seconds_to_first_env_step']:.1f} s | "
+            f"{_peer(one)} | {one['seconds_to_first_env_step']:.1f} s | "
             f"{one['peak_memory_mib']:.0f} MiB |"
         )
     return "\n".join(lines)
+
+
+def _peer(one: dict[str, Any]) -> str:
+    if "peer" not in one:
+        return "-"
+    return f"{_ratio(one, one['peer']['name'])} of {NAMES[one['peer']['name']]}"
 
 
 def _ratio(one: dict[str, Any], name: str) -> str:
@@ -67,6 +111,7 @@ def _ratio(one: dict[str, Any], name: str) -> str:
 
 
 def split_table(found: dict[str, dict[str, Any]]) -> str:
+    found = {name: one for name, one in found.items() if name not in BY_HAND}
     names = list(next(iter(found.values()))["split"])
     head = [f"{one['env']}, {', '.join(one['arm'])}, {one['members']}" for one in found.values()]
     lines = [f"| us per env step | {' | '.join(head)} |", "|---|" + "---|" * len(head)]
@@ -105,6 +150,9 @@ def main() -> None:
     insert(page, "machine", f"Measured on: {text}.")
     insert(page, "rates", rates_table(found))
     insert(page, "split", split_table(found))
+    filtered = RESULTS / "filtered.json"
+    if filtered.exists():
+        insert(page, "filtered", filtered_table(json.loads(filtered.read_text())))
     scaled = RESULTS / "scale.json"
     if scaled.exists():
         result = json.loads(scaled.read_text())

@@ -55,12 +55,15 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
 
 
 def _tame_mujoco() -> None:
-    """MuJoCo's warnings become Python's, instead of lines on stdout and a MUJOCO_LOG.TXT."""
+    """MuJoCo's warnings become Python's, instead of lines on stdout and a MUJOCO_LOG.TXT.
+
+    What it calls deprecated is in the model files that Gymnasium ships: nothing for a user to mend.
+    """
     import mujoco
 
     def warn(message: str) -> None:
-        kind = DeprecationWarning if "deprecated" in message else RuntimeWarning
-        warnings.warn(f"MuJoCo: {message.strip()}", kind, stacklevel=2)
+        if "deprecated" not in message:
+            warnings.warn(f"MuJoCo: {message.strip()}", RuntimeWarning, stacklevel=2)
 
     mujoco.set_mju_user_warning(warn)
 
