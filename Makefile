@@ -1,5 +1,6 @@
 # make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
 # make test   install into .venv, run the tests
+# make test-slow  the tests that take minutes; installs what they need besides (Ray)
 # make lint   style, format and types
 # make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
 
@@ -7,7 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: setup demo test lint results clean
+.PHONY: setup demo test test-slow lint results clean
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
@@ -21,6 +22,10 @@ BIN := .venv/bin
 	$(BIN)/pip install --quiet -e '.[dev]'
 	@touch $@ .venv/.run
 
+.venv/.cluster: .venv/bin/python pyproject.toml
+	$(BIN)/pip install --quiet -e '.[dev,cluster]'
+	@touch $@ .venv/.dev .venv/.run
+
 setup: .venv/.dev
 
 demo: .venv/.run
@@ -28,6 +33,9 @@ demo: .venv/.run
 
 test: .venv/.dev
 	$(BIN)/python -m pytest -n 2
+
+test-slow: .venv/.cluster
+	$(BIN)/python -m pytest -m slow
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

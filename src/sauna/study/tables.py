@@ -214,9 +214,10 @@ def settings(results: Mapping[str, Any]) -> str:
     folds = "".join(_cell(cell, base.get(cell["task"])) for cell in results["cells"])
     parts = {name: results[name] for name in ("settings", "versions", "machine")}
     rows: list[tuple[str, Sequence[str]]] = [("git revision", [_value(results["git"])])]
-    for name, values in parts.items():
-        rows.append((name, ()))
-        rows += [(escape(key), [_value(value)]) for key, value in values.items()]
+    for name, found in parts.items():
+        for values in found if isinstance(found, list) else [found]:  # a list: runs differ in it
+            rows.append((name, ()))
+            rows += [(escape(key), [_value(value)]) for key, value in values.items()]
     return folds + _fold("The study: settings, versions, machine", table(("Name", "Value"), rows))
 
 
