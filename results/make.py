@@ -89,7 +89,10 @@ def ppo_table(results: dict[str, Any]) -> str:
     ]
     for cell in results["cells"]:
         if cell["label"] in ("ppo", "ppo, limits end") and cell["members"]:
-            final = sorted(m["final_return"] for m in cell["members"] if m["final_return"])
+            complete = [m for m in cell["members"] if m["status"] == "complete"]
+            final = sorted(m["final_return"] for m in complete if m["final_return"] is not None)
+            if not final:
+                continue
             digits = 1 if abs(final[-1]) < 1000 else 0
             seeds = ", ".join(f"{x:.{digits}f}" for x in final)
             mean = f"{np.mean(final):.{digits}f} +- {np.std(final, ddof=1):.{digits}f}"
@@ -110,14 +113,19 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
         seeds = f"{row['seeds']} of {wanted[row['task'], row['label']]}"
         failed = f", {row['failed']} failed" if row["failed"] else ""
         digits = 1 if abs(row["final_mean"] or 0) < 1000 else 0
-        std = "-" if row["final_std"] is None else f"{row['final_std']:.{digits}f}"
+        std = _number(row["final_std"], digits)
         lines.append(
             f"| {row['task']} | {row['label']} | {seeds}{failed} | "
-            f"{_interval(row['final_iqm'], digits)} | {row['final_mean']:.{digits}f} +- {std} | "
-            f"{row['keep_rate']:.3f} | {row['baseline'] or '-'} | "
+            f"{_interval(row['final_iqm'], digits)} | "
+            f"{_number(row['final_mean'], digits)} +- {std} | "
+            f"{_number(row['keep_rate'], 3)} | {row['baseline'] or '-'} | "
             f"{_interval(row['improvement'], 2)} | {_paper(row['task'], row['label'])} |"
         )
     return "\n".join(lines)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _interval(values: list[float | None] | None, digits: int) -> str:

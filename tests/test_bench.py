@@ -17,7 +17,7 @@ from sauna.presets import resolve
 def test_the_rate_leaves_out_the_warm_up() -> None:
     clock = Clock()
     clock.seen = [(0.0, 0, 10), (50.0, 1, 20), (52.0, 2, 30), (53.0, 3, 40), (57.0, 4, 80)]
-    assert clock.rate() == (80 - 30) / (57 - 52)
+    assert clock.rate() == (80 - 20) / (57 - 50)
 
 
 def test_ratios_are_of_neighbouring_rounds() -> None:
@@ -93,7 +93,9 @@ def test_the_report_shows_every_figure() -> None:
         (["--rounds", "0"], "rounds: must be"),
         (["NoSuch-v0"], "unknown environment"),
         (["--json", "nowhere/x.json"], "is not a folder"),
-        (["--scale", "--against", "sb3"], "not read with --scale"),
+        (["--scale", "--against", "sb3"], "against: not read with --scale"),
+        (["--scale", "--seeds", "3"], "seeds: not read with --scale"),
+        (["--iterations", "1"], "iterations: must be"),
         (["--threshold", "1"], "not read by arm ppo"),
     ],
 )

@@ -102,7 +102,7 @@ def test_non_finite_states_are_named(monkeypatch) -> None:
     envs._slots[1].env.unwrapped.data.qvel[4] = np.nan
     monkeypatch.setattr("sauna.envs.mujoco.mujoco.mj_step", lambda *arguments: None)
     with pytest.raises(
-        EnvironmentFailure, match="1 of seed 3, episode 0, step 1: observation.12. is"
+        EnvironmentFailure, match=r"1 of seed 3, episode 0, step 1: observation.12. is"
     ):
         envs.step(np.zeros((3, 6), np.float32), np.ones(3, bool))
     envs.close()

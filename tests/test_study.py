@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from helpers import SMALL
 from sauna import rundir
 from sauna.errors import BadInput
 from sauna.presets import ARMS
+from sauna.study.command import COMPARED, comparison
+from sauna.study.process import UnitProcess
 from sauna.study.spec import built_in, check, load_spec, read_spec
 from sauna.study.summary import summarize
-from sauna.study.units import SEEDS, seeds_per_unit, units_of
+from sauna.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
 from test_cli import TESTS, sauna, small_flags
 
 TWO = {"tasks": ["A-v0"], "seeds": 6, "arms": [{"label": "ppo"}, {"label": "sauna"}]}
@@ -40,7 +43,19 @@ QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
         ({"tasks": "A"}, "tasks must be a list"),
         ({"baseline": "poo"}, "no arm 'poo'.*'ppo'"),
         ({"arms": [{"label": "ppo"}, {"label": "random-drop"}]}, "needs a filtered arm"),
-        ({"arms": [{"label": "sauna", "seeds": 2}, {"label": "random-drop"}]}, "every task and"),
+        (
+            {"arms": [{"label": "sauna", "seeds": 2}, {"label": "random-drop"}]},
+            "tasks and the seeds",
+        ),
+        ({"tasks": ["A-v0", "A-v0"]}, "each of them once"),
+        ({"arm": "sauna"}, "unknown key 'arm'"),
+        ({"name": "../x"}, "cannot be a folder"),
+        ({"name": "units"}, "cannot be a folder"),
+        ({"arms": [{"label": ["x"]}]}, "arm must be a name"),
+        ({"arms": [{"label": "ppo"}, {"label": "random-drop", "rates_of": "ppo"}]}, "not filter"),
+        ({"arms": [{"label": "random-drop", "rates_of": 3}]}, "rates_of must be a name"),
+        ({"arms": [{"label": "random-drop", "rates_of": "random-drop"}]}, "does not filter"),
+        ({"threshold": 0.8, "arms": [{"label": "ppo"}]}, "threshold is read by none of the arms"),
         ({"arms": [{"label": "ppo", "rates_of": "ppo"}]}, "read by random-drop only"),
         ({"arms": [{"label": "x", "arm": "ppo", "threshold": 0.3}]}, "arm 'x': threshold: not re"),
         ({"minibatches": 7}, "does not divide"),
@@ -50,6 +65,21 @@ QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
 def test_mistakes_in_a_study_are_named(change: dict, message: str) -> None:
     with pytest.raises(BadInput, match=message):
         read_spec({**TWO, **change})
+
+
+def test_a_setting_for_all_arms_goes_to_those_that_read_it() -> None:
+    spec = comparison("A-v0", COMPARED, {"threshold": 0.8, "gamma": 0.9, "vex_coef": 0.1})
+    settings = {arm.label: arm.settings for arm in spec.arms}
+    assert settings["sauna"] == {"threshold": 0.8, "gamma": 0.9, "vex_coef": 0.1}
+    assert settings["ppo"] == {"gamma": 0.9}
+    assert settings["vex-head"] == settings["random-drop"] == {"gamma": 0.9, "vex_coef": 0.1}
+
+
+def test_beside_the_reference_all_arms_take_its_rules() -> None:
+    spec = comparison("A-v0", ("ppo", "random-drop", "sauna-reference"), {})
+    configs = [check(arm, "A-v0") for arm in spec.arms]
+    assert {c.truncation for c in configs} == {"terminate"}
+    assert {c.budget for c in configs} == {"env"}
 
 
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
@@ -156,12 +186,14 @@ def test_random_drop_takes_the_rates_of_the_same_seeds(compared: Path) -> None:
 
 
 def test_running_again_repeats_nothing(compared: Path) -> None:
-    before = {p: p.stat().st_mtime_ns for p in (compared / "units").rglob("*") if p.is_file()}
+    def stamps() -> dict[Path, int]:
+        files = (compared / "units").rglob("*/*")
+        return {path: path.stat().st_mtime_ns for path in files if path.is_file()}
+
+    before = stamps()
     done = sauna("compare", "worlds:Scripted", "--out", str(compared), *FLAGS)
     assert done.returncode == 0
-    assert {p: p.stat().st_mtime_ns for p in (compared / "units").rglob("*") if p.is_file()} == (
-        before
-    )
+    assert stamps() == before
 
 
 def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp_path) -> None:
@@ -219,6 +251,54 @@ def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
     assert "out of luck" in page
     again = sauna("study", "unlucky.toml", "--out", "out", "--processes=2", cwd=tmp_path)
     assert again.returncode == 0 and "FAILED" not in again.stdout
+
+
+def test_a_complete_run_counts_even_if_the_unit_was_split(tmp_path: Path) -> None:
+    unit = units_of(read_spec(TWO), SEEDS)[0]
+    mark_split(unit, tmp_path)
+    assert len(parts(unit, tmp_path)) == 3
+    unit.run(tmp_path).mkdir()
+    rundir.write_json(unit.run(tmp_path) / "summary.json", {"complete": True})
+    assert parts(unit, tmp_path) == [unit]
+
+
+def test_a_second_study_in_the_same_place_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "units").mkdir()
+    with rundir.lock(tmp_path / "units"):
+        done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
+    assert done.returncode == 2 and "is in use by process" in done.stderr
+
+
+def test_lines_that_are_no_messages_are_passed_over(tmp_path: Path, monkeypatch) -> None:
+    """Something prints before the unit has taken over its output."""
+    (tmp_path / "sitecustomize.py").write_text("print('hello')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    told: list[Any] = []
+    ended = threading.Event()
+
+    def tell(message: Any) -> None:
+        told.append(message)
+        if message is None:
+            ended.set()
+
+    process = UnitProcess(
+        {"out": str(tmp_path / "run"), "env": "NoSuch-v0"}, tmp_path / "log", tell
+    )
+    assert ended.wait(60)
+    assert "exit code 1" in process.end()
+    assert "NoSuch-v0" in told[-2]["error"]
+
+
+def test_what_a_run_would_refuse_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    done = sauna("compare", "CartPole-v1", "--log-std-init", "0.5", cwd=tmp_path)
+    assert done.returncode == 2 and "not read with discrete actions" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_study_without_any_result_exits_1(tmp_path: Path) -> None:
+    flags = [*small_flags(seeds="1,"), "--arms=ppo", "--processes=1"]
+    done = sauna("compare", "worlds:Unlucky", "--out", str(tmp_path), *flags)
+    assert done.returncode == 1 and "no training ended well" in done.stderr
 
 
 def test_another_study_of_the_same_name_is_refused(tmp_path: Path) -> None:

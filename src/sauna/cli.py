@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 import traceback
 from pathlib import Path
@@ -21,6 +22,7 @@ from sauna.presets import ARM_HELP, PRESET_HELP, given_by, parse_all
 LISTS = ("envs", "arms", "presets", "filters", "targets", "studies")
 # Fields that a comparison decides itself.
 _STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard")
+_PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
 
 
 class _Parser(argparse.ArgumentParser):
@@ -73,6 +75,10 @@ def make_parser() -> argparse.ArgumentParser:
                              help="where runs and results go (default runs)")  # fmt: skip
         text = "trainings at a time (default: one per core)"
         command.add_argument("--processes", default="0", metavar="N", help=text)
+        text = "where to train: this machine, or a Ray cluster (default local)"
+        command.add_argument("--on", default="local", choices=("local", "ray"), help=text)
+        text = "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)"
+        command.add_argument("--address", default="", help=text)
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
@@ -224,34 +230,43 @@ def _compare(values: dict[str, Any]) -> None:
     env, arms = values.pop("env"), values.pop("arms")
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
-    out, processes = values.pop("out"), values.pop("processes")
-    flags = "".join(f" {flag(name)} {value}" for name, value in values.items())
+    place = {name: values.pop(name) for name in _PLACE}
+    flags = "".join(f" {_as_flag(name, value)}" for name, value in values.items())
     values = {"seeds": 6, **parse_all(values)}
     spec = comparison(env, tuple(arms.split(",")), values)
-    _run_study(spec, out, processes, f"sauna compare {env} --arms {arms}{flags}")
+    _run_study(spec, f"sauna compare {env} --arms {arms}{flags}", **place)
+
+
+def _as_flag(name: str, value: Any) -> str:
+    """What a user types to give a setting."""
+    if isinstance(value, bool):
+        return flag(name) if value else flag("no_" + name)
+    return f"{flag(name)} {shlex.quote(str(value))}"
 
 
 def _study(values: dict[str, Any]) -> None:
     from sauna.study.spec import load_spec
 
-    name, out, processes = values["study"], values["out"], values["processes"]
-    _run_study(load_spec(name), out, processes, f"sauna study {name}")
+    name = values.pop("study")
+    _run_study(load_spec(name), f"sauna study {name}", **values)
 
 
-def _run_study(spec: Any, out: str, processes: str, command: str) -> None:
+def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
     from sauna.study.command import lines, study
 
-    jobs = _whole({"processes": processes}, "processes", 0) or os.cpu_count() or 1
+    jobs = _whole({"processes": processes}, "processes", 0)
     command += f" --out {out}" if out != "runs" else ""
-    summary = study(spec, Path(out), command, jobs, _say)
+    summary = study(spec, Path(out), command, jobs, _say, on, address)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
+    if not any(row["seeds"] for row in summary["table"]):
+        raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
 
 
 def _bench(values: dict[str, Any]) -> None:
     import json
 
-    rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 1)
+    rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 2)
     against, file = values.pop("against"), values.pop("json")
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")
@@ -264,8 +279,10 @@ def _bench(values: dict[str, Any]) -> None:
     from sauna.bench.command import bench, bench_scale, report
 
     if values["scale"]:
-        if against:
-            raise BadInput("against: not read with --scale")
+        fixed = ("seeds", "processes", "envs", "rollout_steps", "hidden")
+        unread = [name for name in fixed if name in values] + ["against"] * bool(against)
+        if unread:
+            raise BadInput(f"{unread[0]}: not read with --scale")
         result = bench_scale({"arm": "ppo", **given}, _say)
     else:
         result = bench(given, rounds=rounds, iterations=iterations, against=against,

@@ -76,7 +76,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     config = resolve(given)
     found = probe(config.env, json.loads(config.env_kwargs))
     config = settle(config, found.spaces)
-    _check_read_after_settling(found.spaces, config, given)
+    check_read_after_settling(found.spaces, config, given)
     drop_rates = _drop_rates(members(config, given))
     TensorBoard.check(config)
     _check_plugins(config, found.spaces)
@@ -108,7 +108,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     return run
 
 
-def _check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
+def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
     """Refuses what the environment's spaces leave unread.
 
     Raises:

@@ -40,7 +40,7 @@ def create(path: Path) -> None:
     Raises:
       BadInput: it holds something already, or cannot be made.
     """
-    if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - {".lock"}):
+    if path.exists() and (not path.is_dir() or any(map(_counts, path.iterdir()))):
         hint = f"; `sauna resume {path}` continues it" if (path / "config.json").exists() else ""
         raise BadInput(f"out: {path} is not empty{hint}")
     try:
@@ -49,11 +49,20 @@ def create(path: Path) -> None:
         raise BadInput(f"out: cannot make {path}: {error.strerror}") from error
 
 
+def _counts(path: Path) -> bool:
+    """Whether a file makes a folder a used one; what a kill cut short does not."""
+    return path.name != ".lock" and not path.name.endswith(".writing")
+
+
+class InUse(BadInput):
+    """Another process holds a folder."""
+
+
 def lock(path: Path) -> IO[str]:
     """Holds the run directory for this process until the returned file is closed or we die.
 
     Raises:
-      BadInput: another process holds it; its number is named.
+      InUse: another process holds it; its number is named.
     """
     file = (path / ".lock").open("a+")
     try:
@@ -62,7 +71,7 @@ def lock(path: Path) -> IO[str]:
         file.seek(0)
         holder = file.read().strip() or "unknown"
         file.close()
-        raise BadInput(f"{path} is in use by process {holder}") from None
+        raise InUse(f"{path} is in use by process {holder}") from None
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()

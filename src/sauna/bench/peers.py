@@ -94,7 +94,8 @@ def _variables() -> dict[str, str]:
 def _sb3(python: Path, env: str, seed: int, seconds: float) -> float:
     script = Path(__file__).with_name("peer_sb3.py")
     command = [str(python), str(script), env, str(seed), str(seconds)]
-    done = subprocess.run(command, capture_output=True, text=True, env=_variables())
+    with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it is started
+        done = subprocess.run(command, capture_output=True, text=True, env=_variables(), cwd=folder)
     if done.returncode:
         raise _failed(done.stderr, done.returncode)
     return float(json.loads(done.stdout.splitlines()[-1])["rate"])
@@ -104,22 +105,23 @@ def _cleanrl(script: Path, python: Path, env: str, seed: int, seconds: float) ->
     """The script prints a line after each update; the first two are not counted."""
     command = [str(python), "-u", str(script.resolve()), "--env-id", env, "--seed", str(seed)]
     seen: list[float] = []
+    last = ""
     with tempfile.TemporaryDirectory() as folder:
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
             env=_variables(),
         )  # fmt: skip
-        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout is not None
         for line in process.stdout:
+            last = line
             if line.startswith("SPS:"):
                 seen.append(time.perf_counter())
                 if len(seen) >= 5 and seen[-1] - seen[2] > seconds:
                     break
         process.kill()
-        errors = process.stderr.read()
         process.wait()
     if len(seen) < 4:
-        raise _failed(errors, process.returncode)
+        raise _failed(last, process.returncode)
     return 2048 * (len(seen) - 3) / (seen[-1] - seen[2])
 
 

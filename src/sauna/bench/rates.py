@@ -60,7 +60,7 @@ class Clock:
 
     def rate(self) -> float:
         """Env steps per second of all members after the warm-up, to the last row."""
-        warm = [entry for entry in self.seen if entry[1] >= WARM_UP]
+        warm = [entry for entry in self.seen if entry[1] >= WARM_UP - 1]
         (first, _, before), (last, _, after) = warm[0], warm[-1]
         return (after - before) / (last - first)
 

@@ -42,10 +42,10 @@ class Timers:
         self._cost = 0.0
 
     def wrap(self, section: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*arguments: Any) -> Any:
+        def timed(*arguments: Any, **named: Any) -> Any:
             self._inside.append(0.0)
             clock = time.perf_counter()
-            result = function(*arguments)
+            result = function(*arguments, **named)
             spent = time.perf_counter() - clock
             self.seconds[section] += spent - self._inside.pop()
             if self._inside:

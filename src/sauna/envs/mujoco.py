@@ -34,7 +34,8 @@ from gymnasium.envs.mujoco import (
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from sauna.envs.contract import Snapshot, Step
-from sauna.envs.gymnasium import GymnasiumEnvs, Slot
+from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, Slot
+from sauna.errors import one_line
 
 
 class Task:
@@ -276,11 +277,9 @@ def time_limit(env: Any) -> int | None:
     It must be exactly Gymnasium's time limit around one of the eleven tasks: any other wrapper, or
     a subclass, may do something in `step` that would be lost.
     """
-    inner = env
-    while type(inner) in (TimeLimit, OrderEnforcing):
-        inner = inner.env
-    limit = getattr(env, "_max_episode_steps", None) if type(env) is TimeLimit else None
-    return limit if type(inner) in TASKS else None
+    if type(env) is not TimeLimit or type(env.env) is not OrderEnforcing:
+        return None
+    return env._max_episode_steps if type(env.env.env) in TASKS else None
 
 
 class MujocoEnvs(GymnasiumEnvs):
@@ -316,7 +315,11 @@ class MujocoEnvs(GymnasiumEnvs):
         which = active.tolist()
         clipped = np.minimum(np.maximum(action, self._low), self._high)
         self._terminated[:] = False
-        self._task.step(which, clipped, self._observation, self._reward, self._terminated)
+        try:
+            self._task.step(which, clipped, self._observation, self._reward, self._terminated)
+        except Exception as error:  # MuJoCo's fatal errors; which environment is not known
+            names = ", ".join(slot.name for slot in self._slots)
+            raise EnvironmentFailure(f"one of {names}: step raised {one_line(error)}") from error
         over = False
         for slot, on, row in zip(self._slots, which, action, strict=True):
             if on:

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from sauna import rundir
-from sauna.envs.probe import probe
+from sauna.envs.probe import Probe, probe
 from sauna.errors import BadInput, Interrupted
+from sauna.run import check_read_after_settling, settle
 from sauna.study.local import LocalExecutor
 from sauna.study.results import gather
+from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
 from sauna.study.summary import summarize
 from sauna.study.units import Unit, seeds_per_unit, units_of
@@ -30,7 +32,10 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     Raises:
       BadInput: unknown arms or settings that cannot be used.
     """
-    values = {"tasks": [env], "arms": [{"label": arm} for arm in arms], **settings}
+    rules = {}
+    if "sauna-reference" in arms:  # beside it the others take its rules, so that the filter differs
+        rules = {"truncation": "terminate", "budget": "env"}
+    values = {"tasks": [env], "arms": [{"label": arm} for arm in arms], **rules, **settings}
     text = json.dumps(values, sort_keys=True, default=list)
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
@@ -38,40 +43,97 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
 
 
 def study(
-    spec: Spec, out: Path, command: str, jobs: int, say: Callable[[str], None]
+    spec: Spec,
+    out: Path,
+    command: str,
+    jobs: int,
+    say: Callable[[str], None],
+    on: str = "local",
+    address: str = "",
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
     Everything is under `out`: `units/` holds the runs, `NAME/` what was found.
 
+    Args:
+      spec: the study.
+      out: the folder.
+      command: that ran it, for the report.
+      jobs: trainings at a time; 0: one per core.
+      say: prints a line.
+      on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
+      address: of the cluster.
+
     Returns:
       the summary.
 
     Raises:
-      BadInput: an environment cannot be used.
+      BadInput: an environment, or the cluster, cannot be used.
       Interrupted: a signal came; running again continues.
     """
-    for task in spec.tasks:
-        for arm in spec.arms:
-            if task in arm.tasks:
-                probe(task, json.loads(check(arm, task).env_kwargs))
-                break
+    if on == "ray":
+        from sauna.study import cluster
+
+        cluster.check(address)
+    elif address:
+        raise BadInput("address: read with --on ray only")
+    _check_runs(spec)
+    if on == "local":
+        return _train(LocalExecutor, spec, out, command, jobs or cores(), say, command)
+    again = f"{command} --on {on}" + (f" --address {address}" if address else "")
+    with cluster.connected(address, jobs) as jobs:
+        return _train(cluster.RayExecutor, spec, out, command, jobs, say, again)
+
+
+def _check_runs(spec: Spec) -> None:
+    """Checks every run of the study as it would be checked when it starts.
+
+    Raises:
+      BadInput: an environment or settings that cannot be used; the arm is named.
+    """
+    found: dict[tuple[str, str], Probe] = {}
+    for arm in spec.arms:
+        for task in arm.tasks:
+            config = check(arm, task)
+            key = task, config.env_kwargs
+            if key not in found:
+                found[key] = probe(task, json.loads(config.env_kwargs))
+            try:
+                settled = settle(config, found[key].spaces)
+                given = {**arm.given(task, arm.seeds), "drop_rate_from": settled.drop_rate_from}
+                check_read_after_settling(found[key].spaces, settled, given)
+            except BadInput as error:
+                raise BadInput(f"arm {arm.label!r}: {error}") from None
+
+
+def _train(
+    executor: type[Executor],
+    spec: Spec,
+    out: Path,
+    command: str,
+    jobs: int,
+    say: Callable[[str], None],
+    again: str,
+) -> dict[str, Any]:
+    """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
     units = units_of(spec, _unit_size(spec, place, jobs))
     folder.mkdir(exist_ok=True)
+    held = rundir.lock(folder)
     view = StudyView(spec, units, folder)
     say(f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, "
         f"{sum(len(unit.seeds) for unit in units)} members; writing to {place}")  # fmt: skip
     with _signals() as noted:
         view.open()
         try:
-            LocalExecutor(folder, jobs, view, lambda: bool(noted)).run(units)
+            executor(folder, jobs, view, lambda: bool(noted)).run(units)
         finally:
             view.close()
+            held.close()
     summary = write(spec, units, folder, place, command)
     if noted:
         name = signal.Signals(noted[0]).name
-        raise Interrupted(noted[0], f"stopped by {name}; continue with: {command}")
+        raise Interrupted(noted[0], f"stopped by {name}; continue with: {again}")
     return summary
 
 

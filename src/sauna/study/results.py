@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sauna import rundir
-from sauna.config import to_json
+from sauna.config import flag, to_json
 from sauna.study.spec import Arm, Spec, check
 from sauna.study.statistics import area_under_curve
 from sauna.study.units import Unit, parts
@@ -59,10 +60,10 @@ def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
 def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any]:
     members = [member for unit in units for member in _members(unit, folder)]
     config = to_json(check(arm, task))
-    flags = {"arm": arm.arm, "seeds": ",".join(map(str, arm.seeds)) + ",", **arm.settings}
+    flags = {**arm.settings, "arm": arm.arm, "seeds": ",".join(map(str, arm.seeds)) + ","}
     if arm.rates_of is not None:
         config["drop_rate_from"] = flags["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
-    text = " ".join(f"--{key.replace('_', '-')} {_shown(value)}" for key, value in flags.items())
+    text = " ".join(_flag(key, value) for key, value in flags.items())
     return {
         "task": task,
         "label": arm.label,
@@ -75,9 +76,15 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
     }
 
 
-def _shown(value: Any) -> str:
-    text = ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-    return f"'{text}'" if " " in text or "," in text else text
+def _flag(name: str, value: Any) -> str:
+    """A setting as it is typed."""
+    if isinstance(value, bool):
+        return flag(name) if value else flag("no_" + name)
+    if isinstance(value, list | tuple):
+        value = ",".join(map(str, value))
+    return (
+        f"{flag(name)} {shlex.quote(json.dumps(value) if isinstance(value, dict) else str(value))}"
+    )
 
 
 def _members(unit: Unit, folder: Path) -> list[dict[str, Any]]:

@@ -20,18 +20,22 @@ arm repeats the measured drop rates of the arm `rates_of`.
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import string
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna.config import FIELDS, Config, parse
+from sauna.config import FIELDS, Config, check_read, parse
 from sauna.errors import BadInput, nearest
-from sauna.presets import ARMS, resolve
+from sauna.presets import ARMS, FIXED, parse_all, resolve
 
 # What a study decides itself.
 _OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard")
+_NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms")
 _ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
 
@@ -72,23 +76,28 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
       BadInput: an unknown key, a label twice or unknown, or settings that cannot be used.
     """
     for key in values:
-        if key not in _TOP and (key not in FIELDS or key in _OWN):
-            known = [*_TOP, *(name for name in FIELDS if name not in _OWN)]
+        if key not in _TOP and (key not in FIELDS or key in (*_OWN, "arm")):
+            known = [*_TOP, *(name for name in FIELDS if name not in (*_OWN, "arm"))]
             raise BadInput(f"study: unknown key {key!r}{nearest(key, known)}")
     common = {key: value for key, value in values.items() if key not in _TOP}
+    parse_all(common)
+    name = _text(values.get("name", "study"), "name")
+    if name in ("units", "") or not set(name) <= _NAME:
+        raise BadInput(f"study: name {name!r} cannot be a folder of its own under --out")
     entries = values.get("arms") or []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         raise BadInput("study: arms must be a list of tables")
     if not entries:
         raise BadInput("study: no arms")
     arms = [_read_arm(dict(entry), values, common) for entry in entries]
+    _check_common(common, arms)
     labels = [arm.label for arm in arms]
     for label in labels:
         if labels.count(label) > 1:
             raise BadInput(f"study: the label {label!r} is given twice")
-    baseline = str(values.get("baseline", labels[0]))
+    baseline = _text(values.get("baseline", labels[0]), "baseline")
     arms = [_settle(arm, arms, baseline) for arm in arms]
-    spec = Spec(str(values.get("name", "study")), baseline, arms, _plain(values))
+    spec = Spec(name, baseline, arms, _plain(values))
     for arm in arms:
         for task in arm.tasks:
             check(arm, task)
@@ -100,19 +109,47 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
         if key not in _ARM and (key not in FIELDS or key in _OWN):
             known = [*_ARM, *(name for name in FIELDS if name not in _OWN)]
             raise BadInput(f"study: unknown key {key!r} in an arm{nearest(key, known)}")
-    arm = entry.get("arm", entry.get("label"))
+    arm = _text(entry.get("arm", entry.get("label")), "arm")
     if arm not in ARMS:
         raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)})"
-                       f"{nearest(str(arm), ARMS)}")  # fmt: skip
+                       f"{nearest(arm, ARMS)}")  # fmt: skip
     tasks = entry.get("tasks", top.get("tasks"))
-    if not isinstance(tasks, list) or not tasks:
-        raise BadInput("study: tasks must be a list of environments")
+    if not isinstance(tasks, list) or not tasks or len(set(map(str, tasks))) < len(tasks):
+        raise BadInput("study: tasks must be a list of environments, each of them once")
     seeds = parse("seeds", entry.get("seeds", top.get("seeds", 6)))
     own = {key: value for key, value in entry.items() if key not in _ARM}
+    optional = {key: entry[key] and _text(entry[key], key) for key in ("baseline", "rates_of")
+                if key in entry}  # fmt: skip
     return Arm(
-        str(entry.get("label", arm)), arm, {**common, **own}, tuple(map(str, tasks)), seeds,
-        entry.get("baseline"), entry.get("rates_of"),
+        _text(entry.get("label", arm), "label"), arm,
+        {**{key: value for key, value in common.items() if reads(arm, own, key)}, **own},
+        tuple(_text(task, "tasks") for task in tasks), seeds,
+        optional.get("baseline"), optional.get("rates_of"),
     )  # fmt: skip
+
+
+def reads(arm: str, own: Mapping[str, Any], key: str) -> bool:
+    """Whether a run of `arm` with its `own` settings takes the setting `key` at all."""
+    config = dataclasses.replace(Config(), **{**ARMS[arm], **parse_all(own)}, arm=(arm,))
+    try:
+        check_read([config], {key: None})
+    except BadInput:
+        return False
+    return key not in FIXED.get(arm, ())
+
+
+def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
+    """Refuses a setting for all arms that none of them takes."""
+    for key in common:
+        if not any(key in arm.settings for arm in arms):
+            raise BadInput(f"study: {key} is read by none of the arms "
+                           f"{', '.join(arm.label for arm in arms)}")  # fmt: skip
+
+
+def _text(value: Any, key: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise BadInput(f"study: {key} must be a name, not {value!r}")
+    return value
 
 
 def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
@@ -130,9 +167,10 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
         if name is not None and name not in known:
             raise BadInput(f"study: there is no arm {name!r}{nearest(name, known)}")
     if source is not None:
-        missing = set(arm.tasks) - set(known[source].tasks)
-        if missing or set(arm.seeds) - set(known[source].seeds):
-            raise BadInput(f"study: {source!r} does not have every task and seed of {arm.label!r}")
+        if ARMS[known[source].arm]["filter"] != "sauna":
+            raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")
+        if set(arm.tasks) - set(known[source].tasks) or arm.seeds != known[source].seeds:
+            raise BadInput(f"study: {source!r} must have the tasks and the seeds of {arm.label!r}")
     own = arm.baseline or (None if arm.label == baseline else baseline)
     return arm._replace(baseline=own, rates_of=source)
 
@@ -153,9 +191,10 @@ def check(arm: Arm, task: str) -> Config:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    import json
-
-    return dict(json.loads(json.dumps(values)))
+    try:
+        return dict(json.loads(json.dumps(values)))
+    except TypeError as error:
+        raise BadInput(f"study: {error}") from None
 
 
 def load_spec(name: str) -> Spec:

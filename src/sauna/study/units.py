@@ -113,7 +113,8 @@ def _is_split(place: Path) -> bool:
 
 def parts(unit: Unit, folder: Path) -> list[Unit]:
     """The units that hold the runs: the unit itself, or one per seed where it was split."""
-    return split(unit, folder) if _is_split(folder / unit.name) else [unit]
+    is_split = _is_split(folder / unit.name) and not unit.is_complete(folder)
+    return split(unit, folder) if is_split else [unit]
 
 
 def needs_split(unit: Unit, folder: Path) -> bool:
