@@ -108,6 +108,7 @@ def test_bad_input(arguments: list[str], message: str, tmp_path, monkeypatch, ca
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_whole_bench_writes_its_figures(tmp_path, capsys) -> None:
     file = tmp_path / "bench.json"
     small = ["--seeds=2", "--rounds=1", "--iterations=2", "--rollout-steps=64", "--minibatches=4"]

@@ -196,6 +196,7 @@ def test_running_again_repeats_nothing(compared: Path) -> None:
     assert stamps() == before
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp_path) -> None:
     """SIGKILL leaves no orphan behind; SIGTERM saves and exits 143."""
     command = [sys.executable, "-m", "sauna", "compare", "worlds:Scripted", "--out", str(tmp_path),
@@ -229,6 +230,7 @@ def wait_for_units(out: Path) -> None:
                 time.sleep(0.1)
 
 
+@pytest.mark.slow
 def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
     """Seed 1 of every arm fails twice; its unit is split, and so is the one that repeats it."""
     arms: list[dict[str, Any]] = [{"label": "sauna"}, {"label": "random-drop"}]
@@ -295,6 +297,7 @@ def test_what_a_run_would_refuse_is_refused_before_anything_is_made(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_study_without_any_result_exits_1(tmp_path: Path) -> None:
     flags = [*small_flags(seeds="1,"), "--arms=ppo", "--processes=1"]
     done = sauna("compare", "worlds:Unlucky", "--out", str(tmp_path), *flags)

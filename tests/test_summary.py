@@ -20,8 +20,9 @@ STEPS = [1000, 2000, 3000]
 LOW = [1300.0, 1310.0, 1325.0, 1290.0, 1301.0, 1333.0]
 HIGH = [1800.0, 1810.0, 1825.0, 1790.0, 1801.0, 1833.0]
 ALIKE = [1302.0, 1311.0, 1322.0, 1288.0, 1304.0, 1330.0]
-ROW = {"task", "label", "seeds", "failed", "running", "final_iqm", "area_iqm", "final_mean",
-       "final_std", "keep_rate", "env_steps", "kept_steps", "improvement"}  # fmt: skip
+ROW = {"task", "label", "baseline", "seeds", "failed", "running", "final_iqm", "area_iqm",
+       "final_mean", "final_std", "keep_rate", "env_steps", "kept_steps",
+       "improvement"}  # fmt: skip
 
 
 def member(seed: int, final: float | None, **changes: Any) -> dict[str, Any]:
