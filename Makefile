@@ -32,7 +32,7 @@ demo: .venv/.run
 	$(BIN)/sauna train InvertedPendulum-v5 --arm sauna --seeds 3 --steps 100000
 
 test: .venv/.dev
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-slow: .venv/.cluster
 	$(BIN)/python -m pytest -m slow

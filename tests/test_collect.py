@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import make_job, train_here
+from sauna.collect.moments import ObservationMoments
 from sauna.core.normalize import initial_moments, normalize, update_moments
 from test_reference import RunningNormalizer
 
@@ -65,6 +66,20 @@ def test_moments_equal_baselines_and_skip_inactive_rows() -> None:
         initial_moments((), 1), np.array([[1.0], [9.0], [3.0]]), np.array([True, False, True])
     )
     np.testing.assert_allclose([partly.mean[0], partly.variance[0]], [2.0, 1.0], rtol=1e-3)
+
+
+def test_compiled_moments_are_the_cores() -> None:
+    rng = np.random.default_rng(1)
+    for number in (1, 4):
+        ours, expected = ObservationMoments(3, 5, 2.0), initial_moments((3,), 5)
+        for _ in range(30):
+            batch, acting = rng.normal(1, 3, (3, number, 5)), rng.random((3, number)) < 0.6
+            out = np.zeros((3, number, 5), np.float32)
+            ours.see_and_normalize(batch, acting, out)
+            expected = update_moments(expected, batch, acting)
+            for got, wanted in zip((ours.mean, ours.variance, ours.count), expected, strict=True):
+                np.testing.assert_allclose(got, wanted, rtol=1e-13)
+            np.testing.assert_allclose(out, normalize(expected, batch, 2.0), rtol=1e-6)
 
 
 def test_normalized_values_are_clipped() -> None:

@@ -9,7 +9,8 @@ import pytest
 from sauna.envs.backend import in_process_envs
 from sauna.envs.contract import episode_seed
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
-from sauna.envs.mujoco import TASKS, MujocoEnvs
+from sauna.envs.mujoco import MujocoEnvs
+from sauna.envs.mujoco_tasks import TASKS
 
 SEEDS = [(3, 0), (3, 1), (7, 0)]
 NAMES = sorted(
@@ -99,13 +100,29 @@ def test_non_finite_states_are_named(monkeypatch) -> None:
     """MuJoCo resets a state that explodes by itself; here it is kept from doing so."""
     envs = in_process_envs("HalfCheetah-v5", {}, SEEDS, "auto")
     envs.reset()
-    envs._slots[1].env.unwrapped.data.qvel[4] = np.nan
-    monkeypatch.setattr("sauna.envs.mujoco.mujoco.mj_step", lambda *arguments: None)
+
+    def explode(*arguments: object) -> None:
+        envs._task.qvel[1, 4] = np.nan
+
+    monkeypatch.setattr("sauna.envs.mujoco_tasks._advance", explode)
     with pytest.raises(
         EnvironmentFailure, match=r"1 of seed 3, episode 0, step 1: observation.12. is"
     ):
         envs.step(np.zeros((3, 6), np.float32), np.ones(3, bool))
     envs.close()
+
+
+def test_episodes_longer_than_the_first_room_for_actions(monkeypatch) -> None:
+    monkeypatch.setattr("sauna.envs.mujoco.ROOM", 8)
+    envs, again = (in_process_envs("Swimmer-v5", {}, SEEDS, "auto") for _ in range(2))
+    actions = wide_actions(envs, 40, seed=3)
+    envs.reset(), again.reset()
+    for action in actions:
+        step = envs.step(action, np.ones(len(SEEDS), bool))
+    np.testing.assert_array_equal(envs.snapshot(2)["actions"], actions[:, 2])
+    np.testing.assert_array_equal(again.restore(2, envs.snapshot(2)), step.observation[2])
+    np.testing.assert_array_equal(again.snapshot(2)["actions"], actions[:, 2])
+    envs.close(), again.close()
 
 
 def test_the_seed_of_an_episode_is_the_contracts() -> None:

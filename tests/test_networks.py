@@ -13,6 +13,7 @@ import pytest
 from scipy import stats
 
 from helpers import configured, make_job, train_here
+from sauna.collect.actor import make_actor
 from sauna.core.distributions import bernoulli, gaussian, multi_categorical
 from sauna.core.policy import make_policy
 from sauna.errors import BadInput
@@ -52,6 +53,27 @@ def test_initialisation_is_baselines() -> None:
         np.testing.assert_array_equal(params[trunk]["layer_0"]["bias"], 0.0)
     np.testing.assert_array_equal(params["log_std"], np.zeros(3))
     assert np.asarray(tree(log_std_init=-0.7)[1]["log_std"]).tolist() == pytest.approx([-0.7] * 3)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@pytest.mark.parametrize("trunk", ["separate", "shared"])
+@pytest.mark.parametrize("hidden", ["7", "64,64", "5,30,6"])
+def test_the_compiled_actor_acts_as_the_network(activation: str, trunk: str, hidden: str) -> None:
+    """Actions are the network's means plus the noise; observations far out saturate the tanh."""
+    settings = {"activation": activation, "trunk": trunk, "hidden": hidden, "envs": 2}
+    config = configured(**settings)
+    policy = make_policy(config, VECTOR)
+    params = np.stack([policy.init(jax.random.key(seed)) for seed in range(3)])
+    params += np.random.default_rng(0).normal(0, 0.1, params.shape).astype(np.float32)
+    actor = make_actor(config, VECTOR, policy, None, 3)
+    actor.load(params)
+    seen = np.random.default_rng(1).normal(0, 3, (3, 2, 11)).astype(np.float32)
+    noise = np.random.default_rng(2).normal(size=(4, 3, 2, 3)).astype(np.float32)
+    actions = actor.act(seen, actor.prepare(noise)[1])
+    for p, vector in enumerate(params):
+        output = np.asarray(policy.apply(vector, seen[p]).policy)
+        expected = output[:, :3] + noise[1, p] * np.exp(output[:, 3:])
+        np.testing.assert_allclose(actions[p], expected, rtol=2e-5, atol=2e-5)
 
 
 def test_the_network_is_what_it_says() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import mujoco
 import numpy as np
 
 from sauna import training
@@ -21,6 +22,8 @@ from sauna.checkpoint import save_checkpoint
 from sauna.collect.host import HostCollector
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import TrainState
+from sauna.envs import mujoco_tasks
+from sauna.envs.mujoco_tasks import BatchTask
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
 from sauna.metrics.rows import metrics_row
@@ -110,24 +113,25 @@ def _timed(program: Program, timers: Timers) -> Program:
 
 
 def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
-    """Puts timers around acting, normalising and stepping; returns what takes MuJoCo's off."""
-    import mujoco
-
+    """Puts timers around acting, normalising and stepping; returns what takes the physics' off."""
     actor, moments = collector._actor, collector.observation_moments
     actor.act = timers.wrap("inference", actor.act)
     if moments is not None:
-        moments.see = timers.wrap("normalisation", moments.see)
-        moments.normalize = timers.wrap("normalisation", moments.normalize)
+        moments.see_and_normalize = timers.wrap("normalisation", moments.see_and_normalize)
     envs.step = timers.wrap("environment", envs.step)
     if hasattr(envs, "_is_finite"):
         envs._is_finite = timers.wrap("checks", envs._is_finite)
-    plain = mujoco.mj_step
-    mujoco.mj_step = timers.wrap("physics", plain)
+    where, name = _physics(envs)
+    plain = getattr(where, name)
+    setattr(where, name, timers.wrap("physics", plain))
+    return lambda: setattr(where, name, plain)
 
-    def restore() -> None:
-        mujoco.mj_step = plain
 
-    return restore
+def _physics(envs: Any) -> tuple[Any, str]:
+    """The module and the name of the function that steps MuJoCo here."""
+    if isinstance(getattr(envs, "_task", None), BatchTask):
+        return mujoco_tasks, "_advance"
+    return mujoco, "mj_step"
 
 
 def _train(

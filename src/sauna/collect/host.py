@@ -81,6 +81,10 @@ class HostCollector:
         self._shape = (len(keys), self._config.envs)
         self._actor = make_actor(self._config, spaces, program.policy, program.act, len(keys))
         self._capacity = capacity(self._config)
+        # What the policy sees [S + 1, P, N, *obs], rows first: each is written and read as a whole.
+        self._observed = np.zeros(
+            (self._capacity + 1, *self._shape, *spaces.observation_shape), spaces.observation_dtype
+        )
         self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
         self._chunks = chunk_sizes(self._config.rollout_steps)
@@ -100,14 +104,14 @@ class HostCollector:
         if not self._config.normalize_observations or self._spaces.observation_kind != "vector":
             return None
         size = self._spaces.observation_shape[0]
-        return ObservationMoments(*self._shape, size, self._config.clip_observations)
+        return ObservationMoments(self._shape[0], size, self._config.clip_observations)
 
     def _allocate(self) -> Any:
         members, number = self._shape
         lead = (members, self._capacity, number)
         spaces = self._spaces
         arrays: dict[str, Any] = {
-            "observation": np.zeros((*lead, *spaces.observation_shape), spaces.observation_dtype),
+            "observation": self._observed[:-1].swapaxes(0, 1),
             "action": np.zeros((*lead, spaces.action_width), spaces.action_dtype),
         }
         for name in ("log_prob", "reward", "value", "next_value", "vex"):
@@ -120,8 +124,7 @@ class HostCollector:
         """Resets every environment; the first observations enter the running moments."""
         self.state.observation[:] = self._envs.reset().reshape(self.state.observation.shape)
         if self.observation_moments is not None:
-            self.observation_moments.plan(np.ones(self._shape, bool), 1)
-            self.observation_moments.see(self.state.observation, 0)
+            self.observation_moments.see(self.state.observation, np.ones(self._shape, bool))
 
     def collect(
         self, params: np.ndarray, hypers: list[Hypers], iteration: int, limit: np.ndarray
@@ -195,33 +198,27 @@ class HostCollector:
         """Acts everywhere for rows `first` to `last` of the buffers."""
         actor, moments, seen = self._actor, self.observation_moments, self.state.observation
         shape, active, width = self._shape, acting.reshape(-1), self._spaces.action_width
-        observations, actions, rewards = (
-            buffer.swapaxes(0, 1)  # rows first
-            for buffer in (self._buffers.observation, self._buffers.action, self._rewards)
-        )
-        if moments is not None:
-            moments.plan(acting, last - first)
+        observations = self._observed
+        actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
-            observations[row] = actor.observation
-            actions[row] = action = actor.act(noise[row - first])
+            actions[row] = action = actor.act(observations[row], noise[row - first])
             step = self._envs.step(action.reshape(-1, width), active)
             rewards[row] = step.reward.reshape(shape)
             seen = step.observation.reshape(seen.shape)
             if moments is None:
-                actor.observation[:] = seen
+                observations[row + 1] = seen
             else:
-                moments.see(seen, row - first)
-                moments.normalize(seen, actor.observation)
+                moments.see_and_normalize(seen, acting, observations[row + 1])
             if step.ended:
                 self._note_ends(params, step, row, acting, final_values)
         self.state.observation[:] = seen
 
     def _show(self) -> None:
-        """Puts the current observations before the actor, normalised."""
+        """Writes the current observations, normalised, to the first row."""
         if self.observation_moments is None:
-            self._actor.observation[:] = self.state.observation
+            self._observed[0] = self.state.observation
         else:
-            self.observation_moments.normalize(self.state.observation, self._actor.observation)
+            self.observation_moments.normalize(self.state.observation, self._observed[0])
 
     def _note_ends(
         self,

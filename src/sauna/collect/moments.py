@@ -1,70 +1,96 @@
 """Running normalisation on the host: observations step by step, rewards a rollout at a time.
 
 The arithmetic is `core.normalize`'s. Observations enter their moments before the policy sees
-them, so those are updated at every vector step, in place; with one env per member, nine small
-numpy calls do it. Rewards are learned from only after the rollout, and are scaled then.
+them, so those are updated at every vector step, in place, by a compiled loop. Rewards are learned
+from only after the rollout, and are scaled then.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from sauna.core.normalize import EPSILON, Moments, initial_moments, update_moments
+from sauna.compiled import compiled
+from sauna.core.normalize import EPSILON, Moments, initial_moments
 
 
 class ObservationMoments:
     """Moments of P members' observations `[P, N, D]`, updated in place.
 
     Attributes:
-      mean, variance: `[P, 1, D]` float64; count: `[P, 1, 1]`.
+      mean, variance: `[P, D]` float64; count: `[P, 1]`.
     """
 
-    def __init__(self, members: int, envs: int, size: int, clip: float) -> None:
-        first = initial_moments((members, 1), size)
-        self.mean, self.variance, self.count = first
-        self._envs, self._clip = envs, clip
-        self._acting = np.ones((members, envs), bool)
-        self._fractions = self._remains = np.zeros((0, members, 1, 1))
-        self._work = np.zeros((2, members, envs, size))
+    def __init__(self, members: int, size: int, clip: float) -> None:
+        self.mean, self.variance, self.count = initial_moments((members,), size)
+        self._clip = clip
 
-    def plan(self, acting: np.ndarray, steps: int) -> None:
-        """Says who acts `[P, N]` in the coming `steps` calls of `see`; their counts follow now."""
-        self._acting = acting
-        if self._envs == 1:
-            number = acting[:, :, None].astype(np.float64)
-            added = np.concatenate([self.count[None], np.repeat(number[None], steps, 0)])
-            counts = np.add.accumulate(added)
-            self._fractions, self._remains = number / counts[1:], counts[:-1] / counts[1:]
-            self.count[:] = counts[-1]
+    def see(self, observation: np.ndarray, acting: np.ndarray) -> None:
+        """Lets those rows of `observation` `[P, N, D]` enter that are acting (`[P, N]`)."""
+        _see(observation, acting, self.mean, self.variance, self.count)
 
-    def see(self, observation: np.ndarray, step: int) -> None:
-        """Lets `observation` `[P, N, D]` enter, as the `step`-th of the plan."""
-        if self._envs > 1:
-            moments = Moments(self.mean[:, 0], self.variance[:, 0], self.count[:, 0])
-            moments = update_moments(moments, observation, self._acting)
-            self.mean[:, 0], self.variance[:, 0], self.count[:, 0] = moments
-            return
-        delta, move = self._work
-        np.subtract(observation, self.mean, out=delta)
-        np.multiply(delta, self._fractions[step], out=move)
-        np.add(self.mean, move, out=self.mean)
-        np.multiply(delta, move, out=move)
-        np.add(self.variance, move, out=self.variance)
-        np.multiply(self.variance, self._remains[step], out=self.variance)
+    def see_and_normalize(
+        self, observation: np.ndarray, acting: np.ndarray, out: np.ndarray
+    ) -> None:
+        """`see`, then `normalize`, in one call."""
+        _see_and_normalize(
+            observation, acting, self.mean, self.variance, self.count, self._clip, out
+        )
 
     def normalize(self, observation: np.ndarray, out: np.ndarray) -> None:
         """Writes the normalised and clipped `observation` `[P, N, D]` to `out`, float32."""
-        centred, scaled = self._work
-        np.subtract(observation, self.mean, out=centred)
-        deviation = np.sqrt(self.variance + EPSILON)
-        np.divide(centred, deviation, out=scaled)
-        np.minimum(scaled, self._clip, out=scaled)
-        np.maximum(scaled, -self._clip, out=scaled)
-        out[...] = scaled
+        _normalize(observation, self.mean, self.variance, self._clip, out)
 
     def of(self, member: int) -> Moments:
         """One member's moments of `[D]`, as views."""
-        return Moments(self.mean[member, 0], self.variance[member, 0], self.count[member, 0])
+        return Moments(self.mean[member], self.variance[member], self.count[member])
+
+
+@compiled
+def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) -> None:
+    """`core.normalize.update_moments`, in place."""
+    members, envs, size = observation.shape
+    for p in range(members):
+        number = acting[p].sum()
+        if number == 0:
+            continue
+        total = count[p, 0] + number
+        fraction, remains = number / total, count[p, 0] / total
+        for d in range(size):
+            batch_mean, batch_variance = 0.0, 0.0
+            for n in range(envs):
+                if acting[p, n]:
+                    batch_mean += observation[p, n, d]
+            batch_mean /= number
+            for n in range(envs):
+                if acting[p, n]:
+                    batch_variance += (observation[p, n, d] - batch_mean) ** 2
+            batch_variance /= number
+            delta = batch_mean - mean[p, d]
+            move = delta * fraction
+            mean[p, d] += move
+            variance[p, d] = (variance[p, d] + delta * move) * remains + batch_variance * fraction
+        count[p, 0] = total
+
+
+@compiled
+def _normalize(observation: Any, mean: Any, variance: Any, clip: float, out: Any) -> None:
+    """`core.normalize.normalize`, written to `out`."""
+    members, envs, size = observation.shape
+    for p in range(members):
+        for n in range(envs):
+            for d in range(size):
+                scaled = (observation[p, n, d] - mean[p, d]) / np.sqrt(variance[p, d] + EPSILON)
+                out[p, n, d] = min(max(scaled, -clip), clip)
+
+
+@compiled
+def _see_and_normalize(
+    observation: Any, acting: Any, mean: Any, variance: Any, count: Any, clip: float, out: Any
+) -> None:
+    _see(observation, acting, mean, variance, count)
+    _normalize(observation, mean, variance, clip, out)
 
 
 def discounted_returns(

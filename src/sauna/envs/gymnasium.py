@@ -164,9 +164,9 @@ class GymnasiumEnvs(HostEnvs):
         """One sum tells whether anything is amiss; only then the culprit is looked for."""
         if self._is_finite():
             return
-        for index in np.flatnonzero(active):
+        for index in np.flatnonzero(active).tolist():
             slot = self._slots[index]
-            where = f"{slot.name}, episode {slot.episode}, step {len(slot.actions)}"
+            where = f"{slot.name}, episode {slot.episode}, step {self._steps_taken(index)}"
             if not np.isfinite(self._reward[index]):
                 raise EnvironmentFailure(f"{where}: reward is {self._reward[index]}")
             for row in (self._observation[index], self._final[index]):
@@ -174,6 +174,10 @@ class GymnasiumEnvs(HostEnvs):
                     component = int(np.flatnonzero(~np.isfinite(row))[0])
                     value = row.reshape(-1)[component]
                     raise EnvironmentFailure(f"{where}: observation[{component}] is {value}")
+
+    def _steps_taken(self, index: int) -> int:
+        """Env steps of the running episode."""
+        return len(self._slots[index].actions)
 
     def _is_finite(self) -> bool:
         return math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum)

@@ -1,0 +1,24 @@
+"""Small loops that run once per vector step, compiled for the host by Numba.
+
+A numpy call costs about a microsecond whatever it does, and a vector step needed forty of them.
+Loops over a few dozen numbers, compiled, cost what their arithmetic costs. Nothing is reordered
+(no fast-math), so a loop gives the bits that it says.
+
+A compiled function may only call compiled functions of its own file: the cache on disk is renewed
+when that file changes, not when another does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` compiled at its first call, or read from the cache of an earlier process."""
+    try:
+        return numba.njit(cache=True, error_model="numpy")(function)
+    except RuntimeError:  # no folder that could be written to: compiled anew in each process
+        return numba.njit(error_model="numpy")(function)
