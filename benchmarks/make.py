@@ -21,9 +21,9 @@ from sauna.bench.scale import draw
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = {
-    "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "3"],
-    "hopper_6": ["Hopper-v5", "--rounds", "3", "--iterations", "25"],
-    "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "3"],
+    "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "5"],
+    "hopper_6": ["Hopper-v5", "--rounds", "5", "--iterations", "25"],
+    "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "5"],
 }
 # Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.

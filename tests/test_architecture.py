@@ -13,8 +13,8 @@ SOURCE = Path(__file__).parent.parent / "src" / "sauna"
 ALLOWED = {
     "core": {"spaces", "selection"},
     "selection": {"core.types"},
-    "envs": {"spaces", "wire"},
-    "collect": {"core", "envs.contract", "spaces"},
+    "envs": {"compiled", "spaces", "wire"},
+    "collect": {"compiled", "core", "envs.contract", "spaces"},
     "metrics": {"presets", "rundir", "collect", "core", "member_state", "style"},
     "study": {"presets", "rundir", "run", "style", "envs.probe", "metrics.display"},
     "bench": {

@@ -33,7 +33,7 @@ from sauna.core.population import Program, make_program, member_keys, minibatch_
 from sauna.core.types import TrainState
 from sauna.envs.contract import Step, episode_seed
 from sauna.envs.gymnasium import env_maker
-from sauna.envs.mujoco import MujocoEnvs, Walker
+from sauna.envs.mujoco import MujocoEnvs
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
 from sauna.presets import members, resolve
@@ -110,6 +110,8 @@ class CompiledCollector(HostCollector):
         config, number = case.job.config, len(case.keys)
         assert config.envs == 1 and config.hidden == (64, 64) and config.activation == "tanh"
         self._library = library
+        seen = np.ascontiguousarray(self._buffers.observation)  # members first, as the rest
+        self._buffers = self._buffers._replace(observation=seen)
         self.arrays = self._shared(envs, config.rollout_steps, resets)
         self.fields = Fields(**_task_fields(envs, config.env))
         self.fields.members, self.fields.rows = number, self._capacity
@@ -142,8 +144,9 @@ class CompiledCollector(HostCollector):
             "final_observation": np.zeros_like(buffers.observation),
             "reward": self._rewards,
         }
-        if isinstance(envs._task, Walker):
-            shared |= {"healthy_low": envs._task._low, "healthy_high": envs._task._high}
+        low, high = envs._task._constants[6:8]
+        if len(low):
+            shared |= {"healthy_low": low, "healthy_high": high}
         if resets is not None:
             shared["resets"] = resets
         return shared
@@ -178,20 +181,20 @@ class CompiledCollector(HostCollector):
 
 def _task_fields(envs: MujocoEnvs, name: str) -> dict[str, Any]:
     task, env = envs._task, envs._slots[0].env.unwrapped
-    walker = isinstance(task, Walker)
+    judged = len(task._constants[6])
     return {
         "nq": env.model.nq,
         "nv": env.model.nv,
         "nu": env.model.nu,
         "frame_skip": env.frame_skip,
         "limit": envs._limit,
-        "judged": len(task._low) if walker else 0,
+        "judged": judged,
         "normal_velocity": NORMAL_VELOCITY[name],
         "dt": env.dt,
         "forward_weight": env._forward_reward_weight,
         "control_cost": env._ctrl_cost_weight,
-        "healthy_reward": env._healthy_reward if walker else 0.0,
-        "speed_limit": np.inf if task.speed_limit is None else task.speed_limit,
+        "healthy_reward": env._healthy_reward if judged else 0.0,
+        "speed_limit": task._constants[2],
         "reset_scale": env._reset_noise_scale,
     }
 
@@ -330,8 +333,8 @@ def mean_difference(collector: CompiledCollector) -> float:
     actor, means = collector._actor, collector.arrays["means"]
     worst = 0.0
     for row in range(means.shape[1]):
-        actor.observation[:] = collector._buffers.observation[:, row]
-        mean = actor.act(np.float32(0))[:, 0]
+        seen = np.ascontiguousarray(collector._buffers.observation[:, row])
+        mean = actor.act(seen, np.zeros_like(means[:, row, None]))[:, 0]
         worst = max(worst, float(np.abs(mean - means[:, row]).max()))
     return worst
 
