@@ -68,7 +68,7 @@ def loop_joint(vex: np.ndarray, threshold: float, kept_only: bool) -> np.ndarray
 def test_equals_plain_python(make, loop, history: str, threshold: float) -> None:
     vex = np.random.default_rng(3).normal(0.6, 0.7, (60, 3)).astype(np.float32)
     expected = loop(vex, threshold, history == "kept")
-    np.testing.assert_array_equal(run(make(history), vex, threshold), expected)
+    np.testing.assert_array_equal(run(make(history, len(vex)), vex, threshold), expected)
     if threshold == 0.8:
         assert 0.1 < expected.mean() < 0.95  # the comparison saw both decisions
 
@@ -83,13 +83,13 @@ def test_the_four_sauna_rules_differ() -> None:
 
 def test_the_first_step_is_always_kept() -> None:
     vex = np.zeros((3, 2), np.float32)
-    np.testing.assert_array_equal(run(sauna_per_env("all"), vex)[0], [True, True])
-    assert not run(sauna_per_env("all"), vex)[1:].any()  # |0| / (0 + eps) < 0.3
+    np.testing.assert_array_equal(run(sauna_per_env("all", 8), vex)[0], [True, True])
+    assert not run(sauna_per_env("all", 8), vex)[1:].any()  # |0| / (0 + eps) < 0.3
 
 
 def test_threshold_0_keeps_everything_even_nan() -> None:
     vex = np.array([[1.0], [np.nan], [0.0], [-3.0]], np.float32)
-    assert run(sauna_per_env("all"), vex, 0.0).all()
+    assert run(sauna_per_env("all", 8), vex, 0.0).all()
 
 
 @settings(max_examples=50, deadline=None)

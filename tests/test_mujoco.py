@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from sauna.envs.backend import in_process_envs
 from sauna.envs.contract import episode_seed
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.mujoco import MujocoEnvs
-from sauna.envs.mujoco_tasks import TASKS
+from sauna.envs.mujoco_tasks import TASKS, Runner, Task, make_task
 
 SEEDS = [(3, 0), (3, 1), (7, 0)]
 NAMES = sorted(
@@ -94,6 +96,13 @@ def test_what_the_fast_path_does_not_know_is_left_to_gymnasium() -> None:
         assert type(in_process_envs("WrappedHopper-v0", {}, SEEDS, "auto")) is GymnasiumEnvs
     finally:
         del gymnasium.registry["WrappedHopper-v0"]
+
+
+def test_a_model_of_many_motors_is_stepped_by_its_own_method(monkeypatch) -> None:
+    """numpy adds eight numbers and more pairwise, so the compiled loop would round differently."""
+    env = SimpleNamespace(model=SimpleNamespace(nu=8))
+    monkeypatch.setitem(TASKS, SimpleNamespace, Runner)
+    assert type(make_task([env])) is Task
 
 
 def test_non_finite_states_are_named(monkeypatch) -> None:

@@ -4,8 +4,8 @@ A numpy call costs about a microsecond whatever it does, and a vector step neede
 Loops over a few dozen numbers, compiled, cost what their arithmetic costs. Nothing is reordered
 (no fast-math), so a loop gives the bits that it says.
 
-A compiled function may only call compiled functions of its own file: the cache on disk is renewed
-when that file changes, not when another does.
+A compiled function may only call compiled functions and read constants of its own file, and of no
+library: the cache on disk is renewed when that file changes, not when something else does.
 """
 
 from __future__ import annotations

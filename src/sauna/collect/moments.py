@@ -35,12 +35,12 @@ class ObservationMoments:
     ) -> None:
         """`see`, then `normalize`, in one call."""
         _see_and_normalize(
-            observation, acting, self.mean, self.variance, self.count, self._clip, out
+            observation, acting, self.mean, self.variance, self.count, EPSILON, self._clip, out
         )
 
     def normalize(self, observation: np.ndarray, out: np.ndarray) -> None:
         """Writes the normalised and clipped `observation` `[P, N, D]` to `out`, float32."""
-        _normalize(observation, self.mean, self.variance, self._clip, out)
+        _normalize(observation, self.mean, self.variance, EPSILON, self._clip, out)
 
     def of(self, member: int) -> Moments:
         """One member's moments of `[D]`, as views."""
@@ -75,22 +75,31 @@ def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) ->
 
 
 @compiled
-def _normalize(observation: Any, mean: Any, variance: Any, clip: float, out: Any) -> None:
+def _normalize(
+    observation: Any, mean: Any, variance: Any, epsilon: float, clip: float, out: Any
+) -> None:
     """`core.normalize.normalize`, written to `out`."""
     members, envs, size = observation.shape
     for p in range(members):
         for n in range(envs):
             for d in range(size):
-                scaled = (observation[p, n, d] - mean[p, d]) / np.sqrt(variance[p, d] + EPSILON)
+                scaled = (observation[p, n, d] - mean[p, d]) / np.sqrt(variance[p, d] + epsilon)
                 out[p, n, d] = min(max(scaled, -clip), clip)
 
 
 @compiled
 def _see_and_normalize(
-    observation: Any, acting: Any, mean: Any, variance: Any, count: Any, clip: float, out: Any
+    observation: Any,
+    acting: Any,
+    mean: Any,
+    variance: Any,
+    count: Any,
+    epsilon: float,
+    clip: float,
+    out: Any,
 ) -> None:
     _see(observation, acting, mean, variance, count)
-    _normalize(observation, mean, variance, clip, out)
+    _normalize(observation, mean, variance, epsilon, clip, out)
 
 
 def discounted_returns(

@@ -16,7 +16,7 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from sauna.compiled import compiled
 from sauna.envs.contract import Snapshot, Step
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, Slot
-from sauna.envs.mujoco_tasks import TASKS, physics_is_linked
+from sauna.envs.mujoco_tasks import TASKS, make_task, physics_is_linked
 from sauna.errors import one_line
 
 ROOM = 1000  # steps of an episode that there is room for from the start
@@ -48,7 +48,7 @@ class MujocoEnvs(GymnasiumEnvs):
         limit = time_limit(self._slots[0].env)
         assert limit is not None
         envs = [slot.env.unwrapped for slot in self._slots]
-        self._task = TASKS[type(envs[0])](envs)
+        self._task = make_task(envs)
         self._limit, self._over = limit, False
         self._low, self._high = envs[0].action_space.low, envs[0].action_space.high
         self._clipped = np.zeros((len(envs), len(self._low)), np.float32)

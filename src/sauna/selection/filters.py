@@ -76,11 +76,16 @@ def informative(vex: Array, history: History, threshold: Array) -> Array:
     return (history.number == 0) | ~(ratio < threshold)
 
 
-def sauna_per_env(history: str) -> Filter:
-    """Eq. 7 for each env by itself. `history`: medians over `all` steps or the `kept` ones."""
+def sauna_per_env(history: str, quota: int) -> Filter:
+    """Eq. 7 for each env by itself.
+
+    Args:
+      history: medians over `all` steps or the `kept` ones.
+      quota: kept steps that one env needs; more are never in a history of the kept.
+    """
 
     def init(num_envs: int, capacity: int) -> History:
-        return empty_history((num_envs,), capacity)
+        return empty_history((num_envs,), quota if history == "kept" else capacity)
 
     def keep(
         state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
@@ -97,15 +102,15 @@ def sauna_per_env(history: str) -> Filter:
     return Filter(init, keep)
 
 
-def sauna_joint(history: str) -> Filter:
-    """Eq. 7 for a vector step as a whole, as the released code does.
+def sauna_joint(history: str, quota: int) -> Filter:
+    """Eq. 7 for a vector step as a whole, as the released code does; see `sauna_per_env`.
 
     `runner.py` of the authors' release compares |mean over envs| with the median of all envs'
     predictions pooled, and keeps or drops the step of every env together.
     """
 
     def init(num_envs: int, capacity: int) -> History:
-        return empty_history((), capacity * num_envs)
+        return empty_history((), num_envs * (quota if history == "kept" else capacity))
 
     def keep(
         state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
@@ -143,7 +148,8 @@ def make_filter(config: Config) -> Filter | None:
     if config.filter == "random-drop":
         return random_drop()
     if config.filter == "sauna":
-        return (sauna_joint if config.decision == "joint" else sauna_per_env)(config.history)
+        rule = sauna_joint if config.decision == "joint" else sauna_per_env
+        return rule(config.history, config.rollout_steps)
     filter = import_name("filter", config.filter)
     if not isinstance(filter, Filter):
         raise BadInput(f"filter: {config.filter} is not a sauna.Filter")
