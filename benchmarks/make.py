@@ -47,7 +47,7 @@ def measure() -> None:
 
 def measure_filtered() -> None:
     """Filtered arms against PPO, in turn, per env step."""
-    common = {"env": "HalfCheetah-v5", "seeds": 6, "steps": 6 * 51_200}
+    common = {"env": "HalfCheetah-v5", "seeds": 6, "steps": 61_440}
     arms = {
         name: partial(training_rate, {**common, **settings}) for name, settings in FILTERED.items()
     }

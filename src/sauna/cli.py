@@ -283,7 +283,7 @@ def _bench(values: dict[str, Any]) -> None:
         unread = [name for name in fixed if name in values] + ["against"] * bool(against)
         if unread:
             raise BadInput(f"{unread[0]}: not read with --scale")
-        result = bench_scale({"arm": "ppo", **given}, _say)
+        result = bench_scale({"arm": "ppo", **given}, rounds, _say)
     else:
         result = bench(given, rounds=rounds, iterations=iterations, against=against,
                        script=Path(script) if script else None, say=_say)  # fmt: skip

@@ -84,7 +84,9 @@ def bench(
     return result
 
 
-def bench_scale(given: Mapping[str, Any], say: Callable[[str], None]) -> dict[str, Any]:
+def bench_scale(
+    given: Mapping[str, Any], rounds: int, say: Callable[[str], None]
+) -> dict[str, Any]:
     """The rate against members, environments, width and processes, with the machine named.
 
     Raises:
@@ -98,7 +100,7 @@ def bench_scale(given: Mapping[str, Any], say: Callable[[str], None]) -> dict[st
         "machine": rundir.machine(),
         "versions": rundir.versions(),
         "git": rundir.git_revision(),
-        "scale": scale(given, say),
+        "scale": scale(given, rounds, say),
     }
 
 

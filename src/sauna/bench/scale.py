@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from sauna.bench.rates import WARM_UP, training_rate
@@ -37,26 +38,43 @@ def settings_at(axis: str, value: int) -> dict[str, Any]:
 
 
 def scale(
-    given: Mapping[str, Any], say: Callable[[str], None]
-) -> dict[str, list[dict[str, float]]]:
-    """Env steps per second at every point of each axis: `{axis: [{"value", "rate"}, ...]}`."""
-    found: dict[str, list[dict[str, float]]] = {}
-    for axis, values in AXES.items():
-        found[axis] = []
-        for value in values:
-            if axis == "processes" and value > (os.cpu_count() or 1):
-                continue
-            settings = {**given, **settings_at(axis, value)}
-            config = resolve(settings)
-            batch = config.rollout_steps * config.envs
-            iterations = WARM_UP + max(3, -(-ENOUGH // (batch * len(config.seeds))))
-            rate = training_rate({**settings, "steps": batch * iterations})
-            found[axis].append({"value": value, "rate": rate})
-            say(f"{value} {LABELS[axis]}: {rate:,.0f} env steps/s")
-    return found
+    given: Mapping[str, Any], rounds: int, say: Callable[[str], None]
+) -> dict[str, list[dict[str, Any]]]:
+    """Env steps per second at every point of each axis, all of them once per round.
+
+    Returns:
+      `{axis: [{"value", "rate", "rates"}, ...]}`: the median of the rounds, and each of them.
+    """
+    cores = os.cpu_count() or 1
+    points = {
+        axis: [value for value in values if axis != "processes" or value <= cores]
+        for axis, values in AXES.items()
+    }
+    rates: dict[tuple[str, int], list[float]] = {}
+    for number in range(rounds):
+        for axis, values in points.items():
+            for value in values:
+                rate = _rate({**given, **settings_at(axis, value)})
+                rates.setdefault((axis, value), []).append(rate)
+                text = f"round {number + 1} of {rounds}: {value} {LABELS[axis]}"
+                say(f"{text}: {rate:,.0f} env steps/s")
+    return {
+        axis: [
+            {"value": value, "rate": median(rates[axis, value]), "rates": rates[axis, value]}
+            for value in values
+        ]
+        for axis, values in points.items()
+    }
 
 
-def draw(found: Mapping[str, list[dict[str, float]]], title: str, path: Path) -> None:
+def _rate(settings: Mapping[str, Any]) -> float:
+    config = resolve(settings)
+    batch = config.rollout_steps * config.envs
+    iterations = WARM_UP + max(3, -(-ENOUGH // (batch * len(config.seeds))))
+    return training_rate({**settings, "steps": batch * iterations})
+
+
+def draw(found: Mapping[str, list[dict[str, Any]]], title: str, path: Path) -> None:
     """One panel per axis."""
     from sauna.style import applied, save
 
@@ -66,7 +84,10 @@ def draw(found: Mapping[str, list[dict[str, float]]], title: str, path: Path) ->
         figure, axes = plt.subplots(1, len(found), figsize=(3.1 * len(found), 3), sharey=True)
         for axis, (name, points) in zip(axes, found.items(), strict=True):
             values = [point["value"] for point in points]
-            axis.plot(values, [point["rate"] / 1000 for point in points], "o-", color="#0072B2")
+            axis.plot(values, [point["rate"] / 1000 for point in points], "-", color="#0072B2")
+            for point in points:
+                each = [rate / 1000 for rate in point["rates"]]
+                axis.plot([point["value"]] * len(each), each, "o", color="#0072B2", markersize=3)
             axis.set_xscale("log", base=2)
             axis.set_xticks(values, [str(value) for value in values])
             axis.minorticks_off()
