@@ -95,6 +95,7 @@ def test_the_report_shows_every_figure() -> None:
         (["--json", "nowhere/x.json"], "is not a folder"),
         (["--scale", "--against", "sb3"], "against: not read with --scale"),
         (["--scale", "--seeds", "3"], "seeds: not read with --scale"),
+        (["--scale", "--iterations", "9"], "iterations: not read with --scale"),
         (["--iterations", "1"], "iterations: must be"),
         (["--threshold", "1"], "not read by arm ppo"),
     ],

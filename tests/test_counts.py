@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import sys
+import tracemalloc
 from collections import Counter
 from typing import Any
 
@@ -11,8 +13,10 @@ import numpy as np
 import pytest
 
 from helpers import make_job
+from sauna.collect import actor, moments
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys, minibatch_order
+from sauna.envs import mujoco, mujoco_tasks
 from sauna.member_state import Counters
 from sauna.training import _hypers, _learn, _limit, make_envs
 
@@ -24,7 +28,8 @@ class Trainer:
     """The loop of `train_members`, counting the calls of compiled functions."""
 
     def __init__(self, env: str, **settings: Any) -> None:
-        self.job = make_job(env, seeds=MEMBERS, rollout_steps=STEPS, steps=10**6, **settings)
+        settings = {"rollout_steps": STEPS, **settings}
+        self.job = make_job(env, seeds=MEMBERS, steps=10**6, **settings)
         self.calls: Counter[str] = Counter()
         self.program = make_program(self.job.config, self.job.spaces)
         counted = {name: self._counted(name) for name in FUNCTIONS}
@@ -37,6 +42,7 @@ class Trainer:
         self.counted = self.program._replace(**counted)
         self.states = [self.program.init(k.init) for k in self.keys]
         self.done = [Counters() for _ in self.keys]
+        self.changed: dict[str, Any] = {}  # hyperparameters, from now on
 
     def _counted(self, name: str) -> Any:
         function = getattr(self.program, name)
@@ -49,7 +55,8 @@ class Trainer:
 
     def collect(self, iteration: int) -> list:
         job = self.job
-        hypers = [_hypers(job, p, self.done[p], iteration) for p in range(MEMBERS)]
+        hypers = [_hypers(job, p, self.done[p], iteration)._replace(**self.changed)
+                  for p in range(MEMBERS)]  # fmt: skip
         limit = np.array([_limit(job.config, c) for c in self.done])
         params = np.stack([np.asarray(state.params) for state in self.states])
         return [self.collector.collect(params, hypers, iteration, limit), hypers]
@@ -86,17 +93,21 @@ def test_a_network_of_another_kind_acts_by_one_call_per_step() -> None:
 
 @pytest.mark.parametrize("arm", ["ppo", "sauna"])
 def test_nothing_is_compiled_after_the_first_iterations(arm: str) -> None:
-    """A filtered arm meets the lengths of its stretches at once here, being told to drop a lot."""
-    settings = {"threshold": 1.0} if arm == "sauna" else {}
-    trainer = Trainer("InvertedPendulum-v5", arm=arm, **settings)
+    """A filtered arm drops nothing at first, and then so much that its stretches are short."""
+    settings = {"threshold": 0.0} if arm == "sauna" else {}
+    trainer = Trainer("InvertedPendulum-v5", arm=arm, rollout_steps=256, **settings)
     for iteration in range(2):
         trainer.iterate(iteration)
+    trainer.changed = {"threshold": np.float32(1.0)}
+    loops = [actor._act, moments._see_and_normalize, mujoco._record, mujoco_tasks._advance]
+    variants = [len(loop.signatures) for loop in loops]
     compiled: list[str] = []
     listen = jax.monitoring.register_event_duration_secs_listener
     listen(lambda event, seconds, **more: compiled.append(event) if "compil" in event else None)
     for iteration in range(2, 6):
         trainer.iterate(iteration)
     assert compiled == []
+    assert [len(loop.signatures) for loop in loops] == variants  # Numba's
     jax.jit(lambda x: x + 1.25)(1.0)
     assert compiled != []  # the listener does hear compilations
     trainer.envs.close()
@@ -133,5 +144,24 @@ def test_python_calls_per_vector_step() -> None:
 PER_STEP = {
     "_act": 1, "_clip": 1, "_advance": 1, "_run": 1, "_record": 1, "_all_finite": 1,
     "_see_and_normalize": 1, "act": 1, "empty_like": 1, "<lambda>": 2, "step": 2, "evaluate": 1,
-    "_is_finite": 1, "tolist": 1, "_told": 1, "__new__": 1, "see_and_normalize": 1, "reshape": 3,
+    "_is_finite": 1, "_make_room": 1, "tolist": 1, "_told": 1, "__new__": 1, "see_and_normalize": 1, "reshape": 3,
 }  # fmt: skip
+
+
+def test_memory_does_not_grow() -> None:
+    """The room for an episode's actions is there from the start, and nothing else is kept."""
+    trainer = Trainer("HalfCheetah-v5", arm="ppo")
+    for iteration in range(3):
+        trainer.iterate(iteration)
+    tracemalloc.start()
+    for iteration in range(3, 40):  # until JAX's own caches have filled
+        trainer.iterate(iteration)
+    gc.collect()
+    before = tracemalloc.get_traced_memory()[0]
+    for iteration in range(40, 72):
+        trainer.iterate(iteration)
+    gc.collect()
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown / (32 * STEPS * MEMBERS) < 24  # bytes per env step: a float would be as much
+    trainer.envs.close()

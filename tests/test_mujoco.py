@@ -25,6 +25,7 @@ KWARGS = [
     ("Walker2d-v5", {"exclude_current_positions_from_observation": False, "frame_skip": 3}),
     ("HalfCheetah-v5", {"ctrl_cost_weight": 0.7, "reset_noise_scale": 0.5}),
     ("Hopper-v5", {"healthy_state_range": [-1.0, 1.0], "healthy_angle_range": [-2.0, 2.0]}),
+    ("Hopper-v5", {"healthy_state_range": [-100, 100]}),  # the default, in whole numbers
     ("Reacher-v5", {"reward_dist_weight": 3}),
 ]
 
@@ -132,6 +133,28 @@ def test_episodes_longer_than_the_first_room_for_actions(monkeypatch) -> None:
     np.testing.assert_array_equal(again.restore(2, envs.snapshot(2)), step.observation[2])
     np.testing.assert_array_equal(again.snapshot(2)["actions"], actions[:, 2])
     envs.close(), again.close()
+
+
+def test_room_is_made_when_another_episode_ends(monkeypatch) -> None:
+    monkeypatch.setattr("sauna.envs.mujoco.ROOM", 3)
+    envs = in_process_envs("InvertedPendulum-v5", {"max_episode_steps": 50}, SEEDS, "auto")
+    envs.reset()
+    every, action = np.ones(len(SEEDS), bool), np.zeros((len(SEEDS), 1), np.float32)
+    envs.step(action, every), envs.step(action, every)
+    envs._slots[0].env.unwrapped.data.qpos[1] = 1.0  # falls as the others take their third step
+    assert envs.step(action, every).terminated.tolist() == [True, False, False]
+    for _ in range(5):
+        envs.step(action, every)
+    assert [len(envs.snapshot(i)["actions"]) for i in range(3)] == [5, 8, 8]
+    assert envs._actions.shape[1] == 12
+    envs.close()
+
+
+def test_without_mujocos_library_tasks_step_themselves(monkeypatch) -> None:
+    monkeypatch.setattr("sauna.envs.mujoco_tasks.physics_is_linked", lambda: False)
+    envs = in_process_envs("Hopper-v5", {}, SEEDS, "auto")
+    assert type(envs) is MujocoEnvs and type(envs._task) is Task
+    envs.close()
 
 
 def test_the_seed_of_an_episode_is_the_contracts() -> None:

@@ -89,7 +89,7 @@ def make_parser() -> argparse.ArgumentParser:
     bench.add_argument("--script", metavar="FILE", help=text)
     bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")
     text = "iterations of each round's training (default 50)"
-    bench.add_argument("--iterations", default="50", help=text)
+    bench.add_argument("--iterations", default=argparse.SUPPRESS, help=text)
     text = "the rate against members, environments, width and processes instead"
     bench.add_argument("--scale", action="store_true", help=text)
     bench.add_argument("--json", metavar="FILE", help="also write the figures there")
@@ -266,6 +266,11 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
 def _bench(values: dict[str, Any]) -> None:
     import json
 
+    fixed = ("iterations", "seeds", "processes", "envs", "rollout_steps", "hidden")
+    unread = [name for name in fixed if name in values] + ["against"] * bool(values["against"])
+    if values["scale"] and unread:
+        raise BadInput(f"{unread[0]}: not read with --scale")
+    values.setdefault("iterations", "50")
     rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 2)
     against, file = values.pop("against"), values.pop("json")
     if file and not Path(file).resolve().parent.is_dir():
@@ -279,10 +284,6 @@ def _bench(values: dict[str, Any]) -> None:
     from sauna.bench.command import bench, bench_scale, report
 
     if values["scale"]:
-        fixed = ("seeds", "processes", "envs", "rollout_steps", "hidden")
-        unread = [name for name in fixed if name in values] + ["against"] * bool(against)
-        if unread:
-            raise BadInput(f"{unread[0]}: not read with --scale")
         result = bench_scale({"arm": "ppo", **given}, rounds, _say)
     else:
         result = bench(given, rounds=rounds, iterations=iterations, against=against,

@@ -20,6 +20,7 @@ import numpy as np
 
 from sauna import run as runs
 from sauna.config import Config
+from sauna.errors import SaunaError
 from sauna.presets import Member
 
 WARM_UP = 2  # iterations that are not counted: imports, compilation, first pages of memory
@@ -61,6 +62,8 @@ class Clock:
     def rate(self) -> float:
         """Env steps per second of all members after the warm-up, to the last row."""
         warm = [entry for entry in self.seen if entry[1] >= WARM_UP - 1]
+        if len(warm) < 2:
+            raise SaunaError("too few iterations to measure a rate")
         (first, _, before), (last, _, after) = warm[0], warm[-1]
         return (after - before) / (last - first)
 

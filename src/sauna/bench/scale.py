@@ -71,6 +71,8 @@ def _rate(settings: Mapping[str, Any]) -> float:
     config = resolve(settings)
     batch = config.rollout_steps * config.envs
     iterations = WARM_UP + max(3, -(-ENOUGH // (batch * len(config.seeds))))
+    if config.filter != "none" and config.dropped == "replace":
+        iterations *= config.max_env_steps_factor  # one may take so many times the env steps
     return training_rate({**settings, "steps": batch * iterations})
 
 

@@ -88,6 +88,7 @@ class HostCollector:
         self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
         self._chunks = chunk_sizes(self._config.rollout_steps)
+        self._uncompiled = program.filter is not None  # without one, every stretch is a rollout
         self.observation_moments = self._observation_moments()
         self.reward_moments = initial_moments((len(keys),), 1)
         self.state = CollectState(
@@ -143,6 +144,8 @@ class HostCollector:
         buffers, members = self._buffers, range(len(self._keys))
         for name in ("valid", "keep", "terminated", "truncated"):
             getattr(buffers, name)[:] = False
+        if self._uncompiled:
+            self._compile_stretches(params[0], hypers[0])
         self._actor.load(params)
         self._show()
         filters = self._start_filters()
@@ -166,6 +169,19 @@ class HostCollector:
                     plans[member] = self._plan(member, t, limit)
         self._fill_next_values(params, final_values, t)
         return [self._collected(member) for member in members]
+
+    def _compile_stretches(self, params: np.ndarray, hypers: Hypers) -> None:
+        """Compiles for every length of a stretch now, so that none has to be later on."""
+        filters, key = self._start_filters(), self._keys[0].filter
+        for size in self._chunks:
+            observation, action = (
+                np.zeros((size, *buffer.shape[2:]), buffer.dtype)
+                for buffer in (self._buffers.observation, self._buffers.action)
+            )
+            vex = np.asarray(self._program.score(params, observation, action))[..., 2]
+            none = np.int32(0)
+            self._program.decide(filters[0], observation, vex, none, none, key, hypers)
+        self._uncompiled = False
 
     def _plan(self, member: int, t: int, limit: np.ndarray) -> _Stretch:
         """A member's next stretch, from row `t` on. It depends on nothing but the member."""

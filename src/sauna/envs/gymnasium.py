@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 import re
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -62,8 +63,13 @@ def _tame_mujoco() -> None:
     import mujoco
 
     def warn(message: str) -> None:
-        if "deprecated" not in message:
-            warnings.warn(f"MuJoCo: {message.strip()}", RuntimeWarning, stacklevel=2)
+        if "deprecated" in message:
+            return
+        text = f"MuJoCo: {message.strip()}"
+        try:
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+        except RuntimeWarning:  # made an error of: raised inside MuJoCo, it would end the process
+            print(text, file=sys.stderr)
 
     mujoco.set_mju_user_warning(warn)
 

@@ -16,7 +16,7 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from sauna.compiled import compiled
 from sauna.envs.contract import Snapshot, Step
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, Slot
-from sauna.envs.mujoco_tasks import TASKS, make_task, physics_is_linked
+from sauna.envs.mujoco_tasks import TASKS, make_task
 from sauna.errors import one_line
 
 ROOM = 1000  # steps of an episode that there is room for from the start
@@ -29,8 +29,6 @@ def time_limit(env: Any) -> int | None:
     a subclass, may do something in `step` that would be lost.
     """
     if type(env) is not TimeLimit or type(env.env) is not OrderEnforcing:
-        return None
-    if not physics_is_linked():
         return None
     return env._max_episode_steps if type(env.env.env) in TASKS else None
 
@@ -55,6 +53,8 @@ class MujocoEnvs(GymnasiumEnvs):
         # The actions of the running episodes `[M, room, A]`, of which `_steps` `[M]` are taken.
         self._actions = np.zeros((len(envs), min(limit, ROOM), len(self._low)), np.float32)
         self._steps = np.zeros(len(envs), np.int64)
+        # Compiles the loops here, where no time limit of a step counts; nobody is active.
+        self.step(np.zeros_like(self._clipped), np.zeros(len(envs), bool))
 
     def _start_episode(self, index: int, slot: Slot) -> None:
         super()._start_episode(index, slot)
@@ -99,7 +99,7 @@ class MujocoEnvs(GymnasiumEnvs):
         self._over = longest >= self._limit or True in self._terminated.tolist()
         if self._over:
             self._end(active)
-        elif longest == self._actions.shape[1]:
+        if longest < self._limit:
             self._make_room(longest)
         return self._told(self._over)
 

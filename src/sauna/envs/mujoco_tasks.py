@@ -9,6 +9,7 @@ own `step` and save only the wrappers.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from pathlib import Path
@@ -119,7 +120,8 @@ def physics_is_linked() -> bool:
     """Makes MuJoCo's C functions known to compiled code; whether they could be found."""
     folder = Path(mujoco.__file__).parent
     for library in [*folder.glob("libmujoco*"), *folder.glob("mujoco.dll")]:
-        llvm.load_library_permanently(str(library))
+        with contextlib.suppress(RuntimeError):  # then the names are not found
+            llvm.load_library_permanently(str(library))
     names = ("mj_step", "mj_getState", "mj_setState")
     return all(llvm.address_of_symbol(name) is not None for name in names)
 
@@ -205,10 +207,11 @@ class Runner(BatchTask):
 
 def _healthy_states(env: Any) -> tuple[np.ndarray, np.ndarray]:
     """Open bounds of the states from z on (all of them for Hopper, z and angle for Walker2d)."""
-    bounds = np.array([env._healthy_z_range, env._healthy_angle_range])
+    bounds = np.array([env._healthy_z_range, env._healthy_angle_range], float)
     if not hasattr(env, "_healthy_state_range"):
         return bounds[:, 0].copy(), bounds[:, 1].copy()
-    states = np.array([env._healthy_state_range] * (env.model.nq + env.model.nv - 1))
+    number = env.model.nq + env.model.nv - 1
+    states = np.array([env._healthy_state_range] * number, float)
     states[0] = bounds[0]
     states[1] = max(states[1, 0], bounds[1, 0]), min(states[1, 1], bounds[1, 1])
     return states[:, 0].copy(), states[:, 1].copy()
@@ -343,4 +346,4 @@ def make_task(envs: list[Any]) -> Task:
     kind = TASKS[type(envs[0])]
     if kind is Runner and envs[0].model.nu > 7:  # a model of the user's
         return Task(envs)  # from eight numbers on numpy's sum is no plain loop
-    return kind(envs)
+    return kind(envs) if physics_is_linked() else Task(envs)

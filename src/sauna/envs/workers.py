@@ -15,6 +15,7 @@ from sauna.errors import SaunaError
 from sauna.spaces import read_spaces
 from sauna.wire import Message, child_ends, receive, send, start_worker
 
+STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
 ARRAYS = [name for name in Step._fields if name != "ended"]
 
 
@@ -49,7 +50,7 @@ class ProcessEnvs(HostEnvs):
                             "backend": backend})  # fmt: skip
             except BrokenPipeError:
                 pass  # named when its answer is read
-        answers = [self._answer(number) for number in range(processes)]
+        answers = [self._answer(number, max(timeout, STARTING)) for number in range(processes)]
         self.spaces = read_spaces(answers[0].header["spaces"])
 
     def reset(self) -> np.ndarray:
@@ -98,12 +99,13 @@ class ProcessEnvs(HostEnvs):
         number = next(k for k, part in enumerate(self._parts) if index in part)
         return number, int(index - self._parts[number][0])
 
-    def _answer(self, number: int) -> Message:
+    def _answer(self, number: int, timeout: float | None = None) -> Message:
         worker = self._workers[number]
         name = f"environment worker {number} (process {worker.process.pid})"
-        if not worker.inbox.poll(self._timeout):
+        timeout = timeout or self._timeout
+        if not worker.inbox.poll(timeout):
             worker.process.kill()
-            raise EnvironmentFailure(f"{name} did not answer within {self._timeout:g} s")
+            raise EnvironmentFailure(f"{name} did not answer within {timeout:g} s")
         try:
             message = receive(worker.inbox)
         except (EOFError, ConnectionResetError):
