@@ -144,7 +144,8 @@ def test_python_calls_per_vector_step() -> None:
 PER_STEP = {
     "_act": 1, "_clip": 1, "_advance": 1, "_run": 1, "_record": 1, "_all_finite": 1,
     "_see_and_normalize": 1, "act": 1, "empty_like": 1, "<lambda>": 2, "step": 2, "evaluate": 1,
-    "_is_finite": 1, "_make_room": 1, "tolist": 1, "_told": 1, "__new__": 1, "see_and_normalize": 1, "reshape": 3,
+    "_is_finite": 1, "_make_room": 1, "tolist": 1, "_told": 1, "__new__": 1, "see_and_normalize": 1,
+    "reshape": 3,
 }  # fmt: skip
 
 

@@ -329,7 +329,7 @@ def validate(case: Case, library: ctypes.CDLL) -> tuple[CompiledCollector, dict[
 
 
 def mean_difference(collector: CompiledCollector) -> float:
-    """Between the policy's means by the stepper and by numpy, of the same observations."""
+    """Between the policy's means by the stepper and by today's loop, of the same observations."""
     actor, means = collector._actor, collector.arrays["means"]
     worst = 0.0
     for row in range(means.shape[1]):

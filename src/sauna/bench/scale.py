@@ -94,7 +94,8 @@ def draw(found: Mapping[str, list[dict[str, Any]]], title: str, path: Path) -> N
             axis.set_xticks(values, [str(value) for value in values])
             axis.minorticks_off()
             axis.set_xlabel(LABELS[name].replace(", ", ",\n"))
-            axis.set_ylim(bottom=0)
+        highest = max(max(point["rates"]) for points in found.values() for point in points)
+        axes[0].set_ylim(0, 1.05 * highest / 1000)  # of all panels: they share the axis
         axes[0].set_ylabel("1000 env steps/s, in sum")
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         figure.tight_layout()
