@@ -22,6 +22,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = {
     "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "5"],
+    "cheetah_6_in_1": ["HalfCheetah-v5", "--processes", "1", "--rounds", "5"],
     "hopper_6": ["Hopper-v5", "--rounds", "5", "--iterations", "25"],
     "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "5"],
 }

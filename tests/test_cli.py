@@ -233,6 +233,7 @@ def test_arms_are_the_options_table() -> None:
     assert {resolve({"env": "x", "arm": a}).threshold for a in ARMS if "sauna" in a} == {0.3}
 
 
+@pytest.mark.slow
 def test_random_drop_repeats_the_rates_of_a_run(tmp_path) -> None:
     """Of its filtered arm: the rows of the PPO members beside it do not count."""
     source, control = tmp_path / "source", tmp_path / "control"

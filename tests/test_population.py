@@ -41,8 +41,13 @@ def test_members_differ() -> None:
     assert not np.array_equal(own(final, "ppo/0")["/adam/mean"], own(final, "ppo/1")["/adam/mean"])
 
 
-@pytest.mark.parametrize("trunk", ["separate", "shared"])
-@pytest.mark.parametrize("target", ["rollout", "minibatch", "episode", "sample"])
+@pytest.mark.parametrize("target, trunk", [
+    ("rollout", "separate"), ("minibatch", "separate"), ("episode", "separate"),
+    ("sample", "separate"), ("sample", "shared"),
+    pytest.param("rollout", "shared", marks=pytest.mark.slow),
+    pytest.param("minibatch", "shared", marks=pytest.mark.slow),
+    pytest.param("episode", "shared", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_off_means_off(target: str, trunk: str) -> None:
     """Threshold 0 and c2 = 0 are PPO bit for bit, whatever the head would have learned."""
     common = {"envs": 2, "trunk": trunk, "steps": 256}
