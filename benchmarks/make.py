@@ -114,7 +114,10 @@ def _ratio(one: dict[str, Any], name: str) -> str:
 def split_table(found: dict[str, dict[str, Any]]) -> str:
     found = {name: one for name, one in found.items() if name not in BY_HAND}
     names = list(next(iter(found.values()))["split"])
-    head = [f"{one['env']}, {', '.join(one['arm'])}, {one['members']}" for one in found.values()]
+    head = []
+    for one in found.values():
+        members = -(-one["members"] // one["processes"])
+        head.append(f"{one['env']}, {members} member" + ("s" if members > 1 else ""))
     lines = [f"| us per env step | {' | '.join(head)} |", "|---|" + "---|" * len(head)]
     for name in names:
         values = [f"{one['split'][name]:.2f}" for one in found.values()]
