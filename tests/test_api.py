@@ -122,6 +122,7 @@ def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
     assert local.metrics == named.metrics
 
 
+@pytest.mark.slow
 def test_videos_are_written_and_read_back(tmp_path) -> None:
     import imageio.v3 as imageio
 
@@ -193,6 +194,7 @@ def test_curves_and_their_interval() -> None:
     np.testing.assert_allclose([low[0], high[0]], [2 - half, 2 + half], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
     from sauna.metrics import display
 

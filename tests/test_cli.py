@@ -134,6 +134,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
         assert word in sauna("list", what).stdout
 
 
+@pytest.mark.slow
 def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> None:
     flags = small_flags(arm="sauna", threshold=0.7, seeds="4,9", envs=2)
     first, second = tmp_path / "first", tmp_path / "second"

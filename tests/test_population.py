@@ -14,8 +14,9 @@ from sauna.errors import BadInput
 from sauna.presets import members, resolve
 
 WORLD = "worlds:Scripted"
-ARMS = [("ppo", {}), ("sauna", {"threshold": 0.9}), ("random-drop", {"drop_rate": 0.3}),
-        ("sauna-reference", {"threshold": 0.6})]  # fmt: skip
+ARMS = [("ppo", {}), ("sauna-reference", {"threshold": 0.6}),
+        pytest.param("sauna", {"threshold": 0.9}, marks=pytest.mark.slow),
+        pytest.param("random-drop", {"drop_rate": 0.3}, marks=pytest.mark.slow)]  # fmt: skip
 
 
 @pytest.mark.parametrize("arm, settings", ARMS)
@@ -42,8 +43,9 @@ def test_members_differ() -> None:
 
 
 @pytest.mark.parametrize("target, trunk", [
-    ("rollout", "separate"), ("minibatch", "separate"), ("episode", "separate"),
-    ("sample", "separate"), ("sample", "shared"),
+    ("rollout", "separate"), ("sample", "separate"), ("sample", "shared"),
+    pytest.param("minibatch", "separate", marks=pytest.mark.slow),
+    pytest.param("episode", "separate", marks=pytest.mark.slow),
     pytest.param("rollout", "shared", marks=pytest.mark.slow),
     pytest.param("minibatch", "shared", marks=pytest.mark.slow),
     pytest.param("episode", "shared", marks=pytest.mark.slow),

@@ -68,7 +68,9 @@ def test_the_action_that_pays(arm: str) -> None:
         np.testing.assert_allclose(output.value, [1.0], atol=0.15)
 
 
-@every_arm
+@pytest.mark.parametrize(
+    "arm", [*ARMS[:-1], pytest.param("sauna-reference", marks=pytest.mark.slow)]
+)
 def test_the_action_that_pays_here(arm: str) -> None:
     for output in learn("MatchingAction", arm)([1.0, -1.0]):
         p = probability_of_1(output.policy)

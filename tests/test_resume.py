@@ -55,8 +55,10 @@ def whole(tmp_path_factory) -> Path:
     return run
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143),
-                                          (signal.SIGKILL, -9)])  # fmt: skip
+@pytest.mark.parametrize("number, code", [
+    (signal.SIGINT, 130), (signal.SIGKILL, -9),
+    pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_a_signal_then_resume_gives_the_same_bytes(whole, tmp_path, number, code) -> None:
     run = tmp_path / "run"
     process = subprocess.Popen(
