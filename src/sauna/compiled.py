@@ -1,7 +1,7 @@
 """Small loops that run once per vector step, compiled for the host by Numba.
 
-A numpy call costs about a microsecond whatever it does, and a vector step needed forty of them.
-Loops over a few dozen numbers, compiled, cost what their arithmetic costs. Nothing is reordered
+On a few dozen numbers a numpy call costs far more than its arithmetic. Compiled loops cost what
+their arithmetic costs. Nothing is reordered
 (no fast-math), so a loop gives the bits that it says.
 
 A compiled function may only call compiled functions and read constants of its own file, and of no

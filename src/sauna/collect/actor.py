@@ -137,7 +137,7 @@ def _affine(x: Any, weight: Any, y: Any) -> None:
 
 @compiled
 def _tanh(y: Any) -> None:
-    """tanh in place, by the rational approximation of Eigen and XLA (within 3e-7 everywhere).
+    """tanh in place, by the rational approximation of Eigen and XLA.
 
     Unlike the library's function it is computed for many numbers at once.
     """

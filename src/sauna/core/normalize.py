@@ -39,14 +39,11 @@ def update_moments(moments: Moments, batch: Any, active: Any) -> Moments:
       active: `[..., N]` bool; other rows count for nothing. Where none is, nothing changes.
     """
     weight = active[..., None]
-    if batch.shape[-2] == 1:  # the mean is the sample and its variance 0: half of the work
-        number, batch_mean, batch_variance = weight[..., 0, :], batch[..., 0, :], 0.0
-    else:
-        number = weight.sum(-2)
-        divisor = number + (number == 0)
-        batch_mean = (batch * weight).sum(-2) / divisor
-        deviation = (batch - batch_mean[..., None, :]) * weight
-        batch_variance = (deviation**2).sum(-2) / divisor
+    number = weight.sum(-2)
+    divisor = number + (number == 0)
+    batch_mean = (batch * weight).sum(-2) / divisor
+    deviation = (batch - batch_mean[..., None, :]) * weight
+    batch_variance = (deviation**2).sum(-2) / divisor
     total = moments.count + number
     fraction = number / total
     delta = batch_mean - moments.mean

@@ -16,7 +16,7 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from sauna.compiled import compiled
 from sauna.envs.contract import Snapshot, Step
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, Slot
-from sauna.envs.mujoco_tasks import TASKS, make_task
+from sauna.envs.mujoco_tasks import TASKS, Outcome, make_task
 from sauna.errors import one_line
 
 ROOM = 1000  # steps of an episode that there is room for from the start
@@ -50,6 +50,7 @@ class MujocoEnvs(GymnasiumEnvs):
         self._limit, self._over = limit, False
         self._low, self._high = envs[0].action_space.low, envs[0].action_space.high
         self._clipped = np.zeros((len(envs), len(self._low)), np.float32)
+        self._outcome = Outcome(self._observation, self._reward, self._terminated)
         # The actions of the running episodes `[M, room, A]`, of which `_steps` `[M]` are taken.
         self._actions = np.zeros((len(envs), min(limit, ROOM), len(self._low)), np.float32)
         self._steps = np.zeros(len(envs), np.int64)
@@ -87,9 +88,7 @@ class MujocoEnvs(GymnasiumEnvs):
             self._truncated[:] = False
         _clip(action, self._low, self._high, self._clipped)
         try:
-            self._task.step(
-                active, self._clipped, self._observation, self._reward, self._terminated
-            )
+            self._task.step(active, self._clipped, self._outcome)
         except Exception as error:  # which environment is not known
             names = ", ".join(slot.name for slot in self._slots)
             raise EnvironmentFailure(f"one of {names}: step raised {one_line(error)}") from error

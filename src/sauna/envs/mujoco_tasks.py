@@ -13,7 +13,7 @@ import contextlib
 import functools
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 import mujoco
@@ -36,6 +36,14 @@ from numba import types
 from sauna.compiled import compiled
 
 
+class Outcome(NamedTuple):
+    """Where a step of M environments is written to; rows of those that stood still are unused."""
+
+    observation: np.ndarray  # [M, D] float64
+    reward: np.ndarray  # [M] float64
+    terminated: np.ndarray  # [M] bool
+
+
 class Task:
     """M environments of one kind, stepped by their own methods.
 
@@ -49,15 +57,9 @@ class Task:
     def gather(self, index: int) -> None:
         """Reads the state of environment `index`, which was reset or replayed."""
 
-    def step(
-        self,
-        active: np.ndarray,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
-        """Steps the active ones with clipped actions `[M, A]`; writes the three other arrays."""
+    def step(self, active: np.ndarray, action: np.ndarray, out: Outcome) -> None:
+        """Steps the active ones with clipped actions `[M, A]`; writes what came of it to `out`."""
+        observation, reward, terminated = out
         for i, on in enumerate(active.tolist()):
             if on:
                 observation[i], reward[i], terminated[i], _, _ = self.envs[i].step(action[i])
@@ -85,33 +87,20 @@ class BatchTask(Task):
         data = self.envs[index].data
         self.qpos[index], self.qvel[index] = data.qpos, data.qvel
 
-    def step(
-        self,
-        active: np.ndarray,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
+    def step(self, active: np.ndarray, action: np.ndarray, out: Outcome) -> None:
         _advance(
             self._addresses,
             self._frame_skip,
-            (_CONTROL, _MOTION),
+            _PARTS,
             active,
             action,
             self._control,
             self.state,
         )
-        self.evaluate(action, observation, reward, terminated)
+        self.evaluate(action, out)
 
-    def evaluate(
-        self,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
-        """Writes what the new states come to; rows of environments that stood still are unused."""
+    def evaluate(self, action: np.ndarray, out: Outcome) -> None:
+        """Writes what the new states come to."""
         raise NotImplementedError
 
 
@@ -133,8 +122,10 @@ _mj_get_state: Any = types.ExternalFunction(
 _mj_set_state: Any = types.ExternalFunction(
     "mj_setState", types.void(types.intp, types.intp, types.uintp, types.uint32)
 )
-_CONTROL = int(mujoco.mjtState.mjSTATE_CTRL)
-_MOTION = int(mujoco.mjtState.mjSTATE_QPOS) | int(mujoco.mjtState.mjSTATE_QVEL)
+_PARTS = (  # of a state: what is written, what is read
+    int(mujoco.mjtState.mjSTATE_CTRL),
+    int(mujoco.mjtState.mjSTATE_QPOS) | int(mujoco.mjtState.mjSTATE_QVEL),
+)
 
 
 @compiled
@@ -195,14 +186,8 @@ class Runner(BatchTask):
         super().gather(index)
         self._before[index] = self.state[index, 0]
 
-    def evaluate(
-        self,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
-        _run(self.state, action, self._before, *self._constants, observation, reward, terminated)
+    def evaluate(self, action: np.ndarray, out: Outcome) -> None:
+        _run(self.state, action, self._before, *self._constants, *out)
 
 
 def _healthy_states(env: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -258,13 +243,8 @@ def _run(
 
 
 class InvertedPendulum(BatchTask):
-    def evaluate(
-        self,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
+    def evaluate(self, action: np.ndarray, out: Outcome) -> None:
+        observation, reward, terminated = out
         observation[:] = self.state
         finite = np.logical_and.reduce(np.isfinite(self.state), 1)
         terminated[:] = ~finite | (np.abs(self.state[:, 1]) > 0.2)
@@ -277,13 +257,8 @@ class InvertedDoublePendulum(BatchTask):
         self._tips = [env.data.site_xpos[0] for env in envs]
         self._constraints = [env.data.qfrc_constraint[:1] for env in envs]
 
-    def evaluate(
-        self,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
+    def evaluate(self, action: np.ndarray, out: Outcome) -> None:
+        observation, reward, terminated = out
         observation[:, :1] = self.qpos[:, :1]
         np.sin(self.qpos[:, 1:], out=observation[:, 1:3])
         np.cos(self.qpos[:, 1:], out=observation[:, 3:5])
@@ -306,13 +281,8 @@ class Reacher(BatchTask):
         self._distance_weight = envs[0]._reward_dist_weight
         self._control_weight = envs[0]._reward_control_weight
 
-    def evaluate(
-        self,
-        action: np.ndarray,
-        observation: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-    ) -> None:
+    def evaluate(self, action: np.ndarray, out: Outcome) -> None:
+        observation, reward, _ = out
         theta = self.qpos[:, :2]
         np.cos(theta, out=observation[:, :2])
         np.sin(theta, out=observation[:, 2:4])
