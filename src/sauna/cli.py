@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import shlex
 import sys
 import traceback
 from pathlib import Path
@@ -226,22 +225,16 @@ def _whole(values: dict[str, Any], name: str, least: int) -> int:
 
 def _compare(values: dict[str, Any]) -> None:
     from sauna.study.command import comparison
+    from sauna.study.results import typed
 
     env, arms = values.pop("env"), values.pop("arms")
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
-    flags = "".join(f" {_as_flag(name, value)}" for name, value in values.items())
+    flags = "".join(f" {typed(name, value)}" for name, value in values.items())
     values = {"seeds": 6, **parse_all(values)}
     spec = comparison(env, tuple(arms.split(",")), values)
     _run_study(spec, f"sauna compare {env} --arms {arms}{flags}", **place)
-
-
-def _as_flag(name: str, value: Any) -> str:
-    """What a user types to give a setting."""
-    if isinstance(value, bool):
-        return flag(name) if value else flag("no_" + name)
-    return f"{flag(name)} {shlex.quote(str(value))}"
 
 
 def _study(values: dict[str, Any]) -> None:

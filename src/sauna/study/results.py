@@ -63,7 +63,7 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
     flags = {**arm.settings, "arm": arm.arm, "seeds": ",".join(map(str, arm.seeds)) + ","}
     if arm.rates_of is not None:
         config["drop_rate_from"] = flags["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
-    text = " ".join(_flag(key, value) for key, value in flags.items())
+    text = " ".join(typed(key, value) for key, value in flags.items())
     return {
         "task": task,
         "label": arm.label,
@@ -76,15 +76,14 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
     }
 
 
-def _flag(name: str, value: Any) -> str:
+def typed(name: str, value: Any) -> str:
     """A setting as it is typed."""
     if isinstance(value, bool):
         return flag(name) if value else flag("no_" + name)
     if isinstance(value, list | tuple):
         value = ",".join(map(str, value))
-    return (
-        f"{flag(name)} {shlex.quote(json.dumps(value) if isinstance(value, dict) else str(value))}"
-    )
+    text = json.dumps(value) if isinstance(value, dict) else str(value)
+    return f"{flag(name)} {shlex.quote(text)}"
 
 
 def _members(unit: Unit, folder: Path) -> list[dict[str, Any]]:
