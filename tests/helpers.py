@@ -10,10 +10,9 @@ import numpy as np
 
 from sauna.config import Config
 from sauna.core.population import Program, make_program
-from sauna.envs.probe import probe
 from sauna.member_state import flat_params
 from sauna.presets import members, resolve
-from sauna.run import settle
+from sauna.run import look_at, placed, settle
 from sauna.training import Job, train_members
 
 SMALL = {
@@ -37,8 +36,8 @@ class Recorder:
     def phase(self, text: str) -> None:
         pass
 
-    def may_start(self, iteration: int) -> bool:
-        return self.stop is None or iteration < self.stop
+    def allowance(self, iteration: int) -> int:
+        return 1_000_000 if self.stop is None else max(self.stop - iteration, 0)
 
     def iteration(self, iteration: int, rows: list[dict], timing: dict) -> None:
         self.rows += rows
@@ -55,8 +54,8 @@ def make_job(env: str, chosen: list[int] | None = None, **settings: Any) -> Job:
     given = {"env": env, "processes": 1, **SMALL, **settings}
     if "network" in settings:
         del given["hidden"]  # which only the MLP reads
-    config = resolve(given)
-    found = probe(env, json.loads(config.env_kwargs))
+    config = placed(resolve(given))
+    found = look_at(config)
     config = settle(config, found.spaces)
     everyone = members(config, given)
     picked = everyone if chosen is None else [everyone[i] for i in chosen]

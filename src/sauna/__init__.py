@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sauna.api import Result, load, resume, train
+    from sauna.envs.jax_env import JaxEnv, Transition
     from sauna.errors import BadInput, SaunaError
     from sauna.evaluation import evaluate
     from sauna.selection.filters import Filter
@@ -13,8 +14,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["BadInput", "Filter", "Result", "SaunaError", "VexTarget", "evaluate", "load",
-           "resume", "train"]  # fmt: skip
+__all__ = ["BadInput", "Filter", "JaxEnv", "Result", "SaunaError", "Transition", "VexTarget",
+           "evaluate", "load", "resume", "train"]  # fmt: skip
 
 _HOMES = {
     "BadInput": "sauna.errors",
@@ -23,6 +24,8 @@ _HOMES = {
     "load": "sauna.api",
     "resume": "sauna.api",
     "train": "sauna.api",
+    "JaxEnv": "sauna.envs.jax_env",
+    "Transition": "sauna.envs.jax_env",
     "evaluate": "sauna.evaluation",
     "Filter": "sauna.selection.filters",
     "VexTarget": "sauna.selection.vex",

@@ -20,6 +20,8 @@ from typing import Any
 
 from sauna.errors import BadInput, nearest, one_line
 
+NATIVE = ("gymnax", "playground", "brax", "mjx")  # `NAME/...`: environments of the device alone
+ON_DEVICE = ("reset", "device", "devices", "distributed")  # fields that only the device reads
 FILTERS = ("none", "sauna", "random-drop")
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
 NETWORKS = ("auto", "mlp", "nature-cnn")
@@ -78,9 +80,32 @@ class Config:
         at_least=0,
         shapes_program=False,
     )
-    backend: str = option("auto", "what steps the environments (auto: a fast path with the same "
-                          "bits where there is one)", choices=("auto", "gymnasium"),
+    backend: str = option("auto", "what steps the environments (auto: the fastest with the same "
+                          "numbers; device: inside the compiled program)",
+                          choices=("auto", "gymnasium", "device"),
                           shapes_program=False)  # fmt: skip
+    reset: str = option(
+        "fresh",
+        "on the device, an episode starts in a new state, or in its environment's first one again",
+        choices=("fresh", "cached"),
+    )
+    device: str = option(
+        "auto",
+        "with backend device: gpu where there is one (auto), or the CPU",
+        choices=("auto", "cpu", "gpu"),
+        shapes_program=False,
+    )
+    devices: int = option(
+        0,
+        "devices that share the population (0: every GPU, or one CPU; 8 simulates 8 on a CPU)",
+        at_least=0,
+        shapes_program=False,
+    )
+    distributed: str = option(
+        "",
+        "HOST:PORT,COUNT,INDEX: COUNT machines train together; INDEX 0 writes the run",
+        shapes_program=False,
+    )
     env_timeout: float = option(
         60.0, "seconds to wait for an environment worker", above=0, shapes_program=False
     )

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sauna import checkpoint, rundir
-from sauna.config import local_parts, to_json
+from sauna.config import Config, local_parts, to_json
 from sauna.errors import Interrupted, SaunaError
 from sauna.metrics.curve import draw_curve
 from sauna.metrics.display import Display
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from sauna.run import Run
 
 LEAD = 2  # iterations that a process may be ahead of the slowest one
+SECONDS_AHEAD = 2.0  # on the device, where a call runs several: what a signal may have to wait
+MOST_AHEAD = 64
 
 
 class Coordinator:
@@ -53,7 +55,7 @@ class Coordinator:
         self._reached = [self._iteration] * len(self._parts)
         self._ended: list[int | None] = [None] * len(self._parts)
         self._due: list[tuple[int, dict[str, int]]] = []  # checkpoints waiting for their states
-        self._granted = 0
+        self._lead, self._granted = LEAD, 0
         self._signal: int | None = None
         self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
@@ -69,8 +71,7 @@ class Coordinator:
         if local_parts(run.config):
             worker = start_thread(partial(serve, dies_alone=False))
         else:
-            worker = start_worker("sauna.worker", {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1",
-                                                   "JAX_PLATFORMS": "cpu"})  # fmt: skip
+            worker = start_worker("sauna.worker", _environment(run.config))
         names = [run.members[index].name for index in part]
         arrays = {
             key: value
@@ -138,10 +139,10 @@ class Coordinator:
         self._tell()
 
     def _grant(self) -> None:
-        """Lets every worker run at most `LEAD` iterations ahead of the slowest."""
+        """Lets every worker run at most `self._lead` iterations ahead of the slowest."""
         running = [r for r, end in zip(self._reached, self._ended, strict=True) if end is None]
-        if running and not self._stopping and min(running) + LEAD > self._granted:
-            self._granted = min(running) + LEAD
+        if running and not self._stopping and min(running) + self._lead > self._granted:
+            self._granted = min(running) + self._lead
             self._tell()
 
     def _tell(self) -> None:
@@ -182,6 +183,8 @@ class Coordinator:
             case "iteration":
                 self._rows.setdefault(header["iteration"], {})[number] = message
                 self._reached[number] = header["iteration"] + 1
+                if self._run.config.backend == "device":
+                    self._lead = lead_for(header["timing"]["seconds"])
                 self._display.rows(header["rows"])
                 self._grant()
                 self._flush()
@@ -242,9 +245,10 @@ class Coordinator:
             "iteration": self._iteration,
             "env_steps": steps,
             "seconds": seconds,
-            "collect_seconds": max(timing["collect_seconds"] for timing in timings),
             "steps_per_second": steps / seconds,
         }
+        if all("collect_seconds" in timing for timing in timings):  # unknown on the device
+            timing["collect_seconds"] = max(timing["collect_seconds"] for timing in timings)
         _append(self._run.path / "metrics.jsonl", rows)
         _append(self._run.path / "timing.jsonl", [timing])
         self._tensorboard.write(rows, timing)
@@ -264,6 +268,19 @@ class Coordinator:
             {"complete": complete, "metric": text, "members": summary},
         )
         self._display.summary(summary)
+
+
+def lead_for(seconds: float) -> int:
+    """Iterations to grant where one takes `seconds`: a call to the device runs many short ones."""
+    return int(min(max(SECONDS_AHEAD / seconds, LEAD), MOST_AHEAD))
+
+
+def _environment(config: Config) -> dict[str, str]:
+    """What a worker's JAX has to know before it is imported."""
+    if config.backend == "device" and config.device == "gpu":
+        # Others may share the GPU: memory is taken as it is needed, not three quarters at once.
+        return {"JAX_PLATFORMS": "cuda", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
 
 
 def _append(path: Path, rows: list[dict[str, Any]]) -> None:

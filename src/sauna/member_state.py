@@ -16,7 +16,8 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
-from sauna.collect.host import Collected, HostCollector
+from sauna.collect.collected import Collected
+from sauna.collect.host import HostCollector
 from sauna.core.normalize import Moments
 from sauna.core.policy import Policy
 from sauna.core.types import TrainState
@@ -43,11 +44,24 @@ class Counters:
     def add(self, collected: Collected) -> None:
         self.env_steps += collected.env_steps
         self.kept_steps += collected.kept_steps
-        self.episodes += len(collected.episodes)
+        self.episodes += collected.ended
         returns = [episode.return_ for episode in collected.episodes]
         reported = [episode.return_ for episode in collected.episodes if episode.kept]
         self.recent_returns = (self.recent_returns + returns)[-WINDOW:]
         self.reported_returns = (self.reported_returns + reported)[-WINDOW:]
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Named as in a checkpoint."""
+        return {
+            f"counters/{key}": np.asarray(value, np.float64 if isinstance(value, list) else np.int64)
+            for key, value in dataclasses.asdict(self).items()
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Counters:
+        """The inverse of `to_arrays`."""
+        names = [part.name for part in dataclasses.fields(cls)]
+        return cls(**{name: arrays[f"counters/{name}"].tolist() for name in names})
 
 
 def named_params(policy: Policy, params: jax.Array) -> dict[str, np.ndarray]:
@@ -81,9 +95,7 @@ def pack_member(
     arrays["adam/count"] = np.asarray(state.optimizer.count)
     arrays["adam/mean"] = np.asarray(state.optimizer.mu)
     arrays["adam/variance"] = np.asarray(state.optimizer.nu)
-    for key, value in dataclasses.asdict(counters).items():
-        dtype = np.float64 if isinstance(value, list) else np.int64
-        arrays[f"counters/{key}"] = np.asarray(value, dtype)
+    arrays |= counters.to_arrays()
     for key, value in (moments_of(collector, p) | collected_of(collector, p)).items():
         arrays[key] = value
     number = collector.state.episode_length.shape[1]
@@ -117,12 +129,7 @@ def unpack_member(
         jnp.asarray(own["adam/variance"]),
     )
     state = TrainState(flat_params(policy, example.params, under("params/", own)), adam)
-    counters = Counters(
-        **{
-            part.name: own[f"counters/{part.name}"].tolist()
-            for part in dataclasses.fields(Counters)
-        }
-    )
+    counters = Counters.from_arrays(own)
     for key, place in moments_of(collector, p).items():
         place[...] = own[key]
     if replay:

@@ -158,15 +158,14 @@ def _check_same_program(arm: str, config: Config, shared: Config) -> None:
 
 
 def stored_config(stored: Mapping[str, Any]) -> Config:
-    """The config that `config.to_json` wrote.
+    """The config that `config.to_json` wrote, perhaps by an older version.
+
+    A field that did not exist then has the default: what was done before there was a choice.
 
     Raises:
-      BadInput: a key is unknown or missing, or a value cannot be read.
+      BadInput: a key is unknown, or a value cannot be read.
     """
-    missing = [name for name in FIELDS if name not in stored]
-    if missing:
-        raise BadInput(f"config: {missing[0]!r} is missing")
-    return Config(**parse_all(stored))
+    return Config(**parse_all({**to_json(Config()), **stored}))
 
 
 def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

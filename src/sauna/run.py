@@ -7,6 +7,7 @@ once, and the training itself happens in the workers that `coordinator.py` start
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import os
 from collections.abc import Mapping
@@ -14,9 +15,10 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna import checkpoint, rundir
-from sauna.config import Config, check_read, local_parts, to_json
+from sauna.config import ON_DEVICE, Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
-from sauna.envs.probe import Probe, probe
+from sauna.envs.native import is_native
+from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.errors import BadInput, one_line
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
@@ -25,8 +27,8 @@ from sauna.spaces import Spaces
 from sauna.worker import configure_jax
 
 # Fields that `resume` may change: they do not touch what is computed.
-RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "checkpoint_every",
-             "keep_checkpoints", "tensorboard")  # fmt: skip
+RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
+             "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
 
 
 def plain(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -73,8 +75,8 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
       BadInput: the settings, the environment or the place of the run are not usable.
     """
     given = plain(given)
-    config = resolve(given)
-    found = probe(config.env, json.loads(config.env_kwargs))
+    config = placed(resolve(given))
+    found = look_at(config)
     config = settle(config, found.spaces)
     check_read_after_settling(found.spaces, config, given)
     drop_rates = _drop_rates(members(config, given))
@@ -108,12 +110,53 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     return run
 
 
+def placed(config: Config) -> Config:
+    """Resolves where the environments run, and on what.
+
+    Raises:
+      BadInput: a setting that is not read there.
+    """
+    if config.backend == "auto" and is_native(config.env, json.loads(config.env_kwargs)):
+        config = dataclasses.replace(config, backend="device")
+    if config.backend != "device":
+        return config
+    if config.env_processes:
+        raise BadInput("env_processes: not read with backend device")
+    most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
+    if most >= 2**31:
+        raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")
+    device = config.device
+    if device == "auto":
+        device = "gpu" if has_gpu() else "cpu"
+    return dataclasses.replace(config, device=device)
+
+
+def has_gpu() -> bool:
+    """Whether there is an NVIDIA GPU and a JAX that can use it; found without importing JAX."""
+    plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+    return Path("/proc/driver/nvidia/version").exists() and any(
+        importlib.util.find_spec(name) is not None for name in plugins
+    )
+
+
+def look_at(config: Config) -> Probe:
+    """What has to be known of the environment before a run starts."""
+    kwargs = json.loads(config.env_kwargs)
+    if config.backend != "device":
+        return probe(config.env, kwargs)
+    configure_jax()
+    return probe_on_device(config.env, kwargs)
+
+
 def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
     """Refuses what the environment's spaces leave unread.
 
     Raises:
       BadInput: naming the field.
     """
+    for name in given:
+        if name in ON_DEVICE and config.backend != "device":
+            raise BadInput(f"{name}: only read with backend device")
     names = ("hidden", "activation", "clip_observations")
     check_read([config], {name: given[name] for name in names if name in given})
     if "log_std_init" in given and spaces.action_kind != "continuous":
@@ -159,6 +202,8 @@ def settle(config: Config, spaces: Spaces) -> Config:
         )
     number = len(config.arm) * len(config.seeds)
     processes = config.processes or os.cpu_count() or 1
+    if config.backend == "device" and (config.device == "gpu" or config.devices > 1):
+        processes = 1  # one program for all members and all devices
     return dataclasses.replace(
         config,
         network=network,
@@ -183,7 +228,10 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     config = stored_config(stored.get("config", {}))
     config = dataclasses.replace(config, **{name: getattr(resolved, name) for name in changes})
     TensorBoard.check(config)
-    found = probe(config.env, json.loads(config.env_kwargs))
+    config = placed(config)
+    if (config.backend == "device") != (stored["config"].get("backend") == "device"):
+        raise BadInput("backend: a run on the device stays there, and one on the host there")
+    found = look_at(config)
     config = settle(config, found.spaces)
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
         raise BadInput(f"{config.env} has other spaces than when the run started: "
@@ -248,7 +296,7 @@ def _check_same(run: Run, loaded: checkpoint.Checkpoint | None) -> None:
         return
     own = run.manifest()
     for name, value in own["config"].items():
-        stored = loaded.manifest["config"].get(name)
+        stored = to_json(stored_config(loaded.manifest["config"]))[name]
         if name not in (*RESUMABLE, "out") and stored != value:
             raise BadInput(f"{loaded.path} is of another run: {name} is {stored!r}, not {value!r}")
     for name in ("spaces", "members"):

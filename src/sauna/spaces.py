@@ -50,12 +50,12 @@ def describe(observation_space: Any, action_space: Any) -> Spaces:
     Raises:
       BadInput: a space that is not supported, by name.
     """
-    kind, shape = _describe_observation(observation_space)
+    kind, shape = describe_observation(observation_space)
     action_kind, sizes = _describe_action(action_space)
     return Spaces(kind, shape, action_kind, sizes, str(observation_space), str(action_space))
 
 
-def _describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
+def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
     from gymnasium import spaces as gym
 
     if isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3):

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from sauna.collect.host import Collected, HostCollector, capacity
+from sauna.collect.collected import Collected, capacity
+from sauna.collect.host import HostCollector
 from sauna.config import Config
 from sauna.core.population import Keys, Program, make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers, TrainState
@@ -40,8 +41,8 @@ class Reporter(Protocol):
 
     def phase(self, text: str) -> None: ...
 
-    def may_start(self, iteration: int) -> bool:
-        """Waits until iteration `iteration` may start; False: stop before it."""
+    def allowance(self, iteration: int) -> int:
+        """Waits until iteration `iteration` may start; how many may from there on. 0: stop."""
 
     def iteration(
         self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
@@ -70,8 +71,13 @@ def train_members(job: Job, reporter: Reporter) -> None:
       NonFinite: an update gave a non-finite loss or parameter; nothing of it was reported.
       EnvironmentFailure: from the environments.
     """
-    reporter.phase("making environments")
     config, members = job.config, job.members
+    if config.backend == "device":
+        from sauna.device_training import train_on_device
+
+        train_on_device(job, reporter)
+        return
+    reporter.phase("making environments")
     program = make_program(config, job.spaces)
     keys = [member_keys(member.seed) for member in members]
     envs = make_envs(job)
@@ -80,7 +86,7 @@ def train_members(job: Job, reporter: Reporter) -> None:
         states, counters = _start(job, program, keys, collector, envs)
         reporter.phase("compiling")
         iteration = job.start
-        while any(_goes_on(config, c) for c in counters) and reporter.may_start(iteration):
+        while any(goes_on(config, c) for c in counters) and reporter.allowance(iteration):
             clock = time.perf_counter()
             hypers = [_hypers(job, p, counters[p], iteration) for p in range(len(members))]
             limit = np.array([_limit(config, c) for c in counters])
@@ -91,7 +97,7 @@ def train_members(job: Job, reporter: Reporter) -> None:
             for p in np.flatnonzero(limit):
                 order = minibatch_order(config, members[p].seed, iteration)
                 states[p], learned = _learn(program, states[p], collected[p], hypers[p], order)
-                _check_finite(members[p], iteration, learned)
+                check_finite(members[p], iteration, learned)
                 counters[p].add(collected[p])
                 rows.append(
                     metrics_row(
@@ -141,7 +147,7 @@ def _start(
     return states, counters
 
 
-def _goes_on(config: Config, counters: Counters) -> bool:
+def goes_on(config: Config, counters: Counters) -> bool:
     """Whether a whole rollout still fits in the budget: a run never oversteps it."""
     used = counters.kept_steps if config.budget == "kept" else counters.env_steps
     return config.steps - used >= config.rollout_steps * config.envs
@@ -149,7 +155,7 @@ def _goes_on(config: Config, counters: Counters) -> bool:
 
 def _limit(config: Config, counters: Counters) -> int:
     """Env steps that each env of a member may try in the coming rollout; 0: it has finished."""
-    if not _goes_on(config, counters):
+    if not goes_on(config, counters):
         return 0
     if config.budget == "kept":
         return capacity(config)
@@ -176,12 +182,16 @@ def _learn(
     hypers: Hypers,
     order: np.ndarray,
 ) -> tuple[TrainState, UpdateMetrics]:
+    assert collected.rollout is not None
     batch = program.make_batch(collected.rollout, hypers)
     state, metrics = program.learn(state, collected.rollout, batch, hypers, order)
     return state, jax.device_get(metrics)
 
 
-def _check_finite(member: Member, iteration: int, metrics: UpdateMetrics) -> None:
+def check_finite(member: Member, iteration: int, metrics: UpdateMetrics) -> None:
+    """Raises:
+    NonFinite: naming the member and the iteration.
+    """
     if not metrics.finite:
         raise NonFinite(f"{member.name}: the update of iteration {iteration} is not finite")
 

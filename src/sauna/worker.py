@@ -48,10 +48,10 @@ class PipeReporter:
     def phase(self, text: str) -> None:
         send(self._outbox, {"kind": "phase", "text": text})
 
-    def may_start(self, iteration: int) -> bool:
+    def allowance(self, iteration: int) -> int:
         with self._changed:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
-            return iteration < self._granted
+            return max(self._granted - iteration, 0)
 
     def iteration(
         self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
@@ -68,7 +68,7 @@ def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
     try:
         header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
-        configure_jax()
+        configure_jax(header["config"]["devices"])
         from sauna.training import train_members
 
         reporter = PipeReporter(inbox, outbox, dies_alone)
@@ -82,8 +82,11 @@ def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
         send(outbox, {"kind": "failure", "message": traceback.format_exc()})
 
 
-def configure_jax() -> None:
+def configure_jax(simulated: int = 0) -> None:
     """One CPU thread per process, synchronous dispatch, and a compilation cache on disk.
+
+    Args:
+      simulated: with JAX_PLATFORMS=cpu, into how many devices the CPU is divided.
 
     With one thread the bits of a result do not depend on the number of cores; the small programs
     here run faster, too. A process that already used JAX keeps its own thread count.
@@ -93,6 +96,8 @@ def configure_jax() -> None:
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if simulated > 1 and os.environ["JAX_PLATFORMS"] == "cpu":
+        jax.config.update("jax_num_cpu_devices", simulated)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         jax.config.update("jax_compilation_cache_dir", os.path.join(base, "sauna", "jax"))

@@ -15,14 +15,16 @@ import jax
 import numpy as np
 
 from sauna.collect.actor import make_actor
-from sauna.collect.moments import (
-    ObservationMoments,
-    discounted_returns,
+from sauna.collect.collected import Collected, Episode, capacity
+from sauna.collect.moments import ObservationMoments, discounted_returns
+from sauna.config import Config
+from sauna.core.normalize import (
+    Moments,
+    initial_moments,
     moments_after_each,
+    normalize,
     scale_rewards,
 )
-from sauna.config import Config
-from sauna.core.normalize import Moments, initial_moments, normalize
 from sauna.core.population import Keys, Program
 from sauna.core.types import Hypers, Rollout
 from sauna.envs.contract import HostEnvs, Step
@@ -36,25 +38,6 @@ class CollectState(NamedTuple):
     discounted_return: np.ndarray  # [P, N] float64
     episode_return: np.ndarray  # [P, N] float64, raw rewards so far
     episode_length: np.ndarray  # [P, N] int64
-
-
-class Episode(NamedTuple):
-    """One finished episode of a member."""
-
-    env: int
-    return_: float
-    length: int
-    truncated: bool
-    kept: bool  # whether its last step was kept (the released code reports only such episodes)
-
-
-class Collected(NamedTuple):
-    """What one member collected in one iteration."""
-
-    rollout: Rollout
-    env_steps: int
-    kept_steps: int
-    episodes: list[Episode]
 
 
 class _Stretch(NamedTuple):
@@ -327,7 +310,7 @@ class HostCollector:
     def _collected(self, member: int) -> Collected:
         episodes = self._finish(member)
         rollout = Rollout(*(buffer[member] for buffer in self._buffers))
-        return Collected(rollout, int(rollout.valid.sum()), int(rollout.keep.sum()), episodes)
+        return Collected(rollout, int(rollout.valid.sum()), int(rollout.keep.sum()), len(episodes), episodes)
 
     def _finish(self, member: int) -> list[Episode]:
         """Scales a member's rewards; its episodes, in the order in which they ended."""
@@ -378,13 +361,6 @@ def running_sum(start: float, values: np.ndarray) -> float:
     for value in values.tolist():
         total += value
     return total
-
-
-def capacity(config: Config) -> int:
-    """Env steps per env (S) that one rollout can hold."""
-    if config.filter == "none" or config.dropped == "mask":
-        return config.rollout_steps
-    return config.rollout_steps * config.max_env_steps_factor
 
 
 def chunk_sizes(rollout_steps: int) -> list[int]:

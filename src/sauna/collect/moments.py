@@ -125,20 +125,3 @@ def discounted_returns(
                 now = 0.0
         sums[:number, n], last[n] = column, now
     return sums, last
-
-
-def moments_after_each(moments: Moments, values: np.ndarray, valid: np.ndarray) -> Moments:
-    """Moments after each row of `values` `[S, N]` has entered where `valid`; fields `[S]`.
-
-    The sums are taken about the mean so far: `var = (n0 var0 + sum d^2) / n - (sum d / n)^2`.
-    """
-    deviation = np.where(valid, values - moments.mean, 0.0)
-    count = moments.count + np.cumsum(valid.sum(1))
-    shift = np.cumsum(deviation.sum(1)) / count
-    square = moments.count * moments.variance + np.cumsum((deviation**2).sum(1))
-    return Moments(moments.mean + shift, np.maximum(square / count - shift**2, 0.0), count)
-
-
-def scale_rewards(moments: Moments, reward: np.ndarray, clip: float) -> np.ndarray:
-    """`clip(r / sqrt(var + eps), +-clip)` of `[S, N]`, by the moments after each row."""
-    return (reward / np.sqrt(moments.variance + EPSILON)[:, None]).clip(-clip, clip)

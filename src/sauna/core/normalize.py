@@ -56,3 +56,23 @@ def normalize(moments: Moments, batch: Any, clip: float) -> Any:
     """`clip((x - mean) / sqrt(var + eps), +-clip)` of `[..., N, D]`."""
     mean, variance = moments.mean[..., None, :], moments.variance[..., None, :]
     return ((batch - mean) / (variance + EPSILON) ** 0.5).clip(-clip, clip)
+
+
+def moments_after_each(moments: Moments, values: Any, valid: Any) -> Moments:
+    """Moments after each row of `values` `[S, N]` has entered where `valid`; fields `[S]`.
+
+    The sums are taken about the mean so far: `var = (n0 var0 + sum d^2) / n - (sum d / n)^2`.
+
+    Args:
+      moments: scalars.
+    """
+    deviation = (values - moments.mean) * valid
+    count = moments.count + valid.sum(1).cumsum()
+    shift = deviation.sum(1).cumsum() / count
+    square = moments.count * moments.variance + (deviation**2).sum(1).cumsum()
+    return Moments(moments.mean + shift, (square / count - shift**2).clip(0.0), count)
+
+
+def scale_rewards(moments: Moments, reward: Any, clip: float) -> Any:
+    """`clip(r / sqrt(var + eps), +-clip)` of `[S, N]`, by the moments after each row `[S]`."""
+    return (reward / (moments.variance + EPSILON)[:, None] ** 0.5).clip(-clip, clip)

@@ -53,18 +53,12 @@ def make_program(config: Config, spaces: Spaces) -> Program:
     """Builds (without compiling) everything that members with this static config run."""
     policy, target = make_policy(config, spaces), make_target(config)
     filter = make_filter(config)
-    shape = (config.rollout_steps, config.envs)
-
-    def draw(root: Array, iteration: Array, block: Array) -> Array:
-        key = jax.random.fold_in(jax.random.fold_in(root, iteration), block)
-        return policy.distribution.draw(key, shape)
-
     return Program(
         config=config,
         policy=policy,
         filter=filter,
         init=jax.jit(partial(init_state, policy)),
-        draw=jax.jit(draw),
+        draw=jax.jit(partial(draw_noise, policy, config)),
         act=jax.jit(map_members(partial(act, policy))),
         score=jax.jit(partial(score, policy)),
         value=jax.jit(lambda params, observation: policy.apply(params, observation).value),
@@ -74,6 +68,12 @@ def make_program(config: Config, spaces: Spaces) -> Program:
             partial(learn, config=config, policy=policy, target=target), donate_argnums=(0,)
         ),
     )
+
+
+def draw_noise(policy: Policy, config: Config, root: Array, iteration: Array, block: Array) -> Array:
+    """Action noise `[T, N, M]` of the rollout's rows from `block * T` on."""
+    key = jax.random.fold_in(jax.random.fold_in(root, iteration), block)
+    return policy.distribution.draw(key, (config.rollout_steps, config.envs))
 
 
 def _nothing_to_decide(*arguments: Any) -> tuple[Any, Array]:
@@ -86,6 +86,8 @@ class Keys(NamedTuple):
     init: Array
     action: Array
     filter: Array
+    env: Array  # of environments on the accelerator; a host environment has a seed per episode
+    order: Array  # of minibatches drawn on the accelerator; see `minibatch_order`
 
 
 def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
@@ -97,4 +99,6 @@ def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
 
 def member_keys(seed: int) -> Keys:
     """Keys that depend on the member's seed alone."""
-    return Keys(*jax.random.split(jax.random.key(seed), 3))
+    root = jax.random.key(seed)
+    init, action, filter = jax.random.split(root, 3)
+    return Keys(init, action, filter, jax.random.fold_in(root, 3), jax.random.fold_in(root, 4))

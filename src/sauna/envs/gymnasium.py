@@ -19,6 +19,7 @@ import numpy as np
 
 from sauna.config import import_name
 from sauna.envs.contract import HostEnvs, Snapshot, Step, episode_seed
+from sauna.envs.native import is_native
 from sauna.errors import BadInput, SaunaError, nearest, one_line
 from sauna.spaces import action_writer, describe, observation_reader
 
@@ -37,6 +38,11 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
     Raises:
       BadInput: there is no such environment; the nearest known id is named.
     """
+    if is_native(env, env_kwargs):
+        from sauna.envs.host_face import HostFace
+        from sauna.envs.jax_native import make_jax_env
+
+        return lambda **more: HostFace(make_jax_env(env, env_kwargs), **more)
     if ":" in env and not _GYMNASIUM_ID.match(env):
         function = import_name("env", env)
         return lambda **more: function(**env_kwargs, **more)

@@ -44,6 +44,18 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     return Probe(spaces, differs)
 
 
+def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
+    """The spaces of an environment on the device, which repeats itself by construction.
+
+    Raises:
+      BadInput: the environment cannot be made, or its spaces are not supported.
+    """
+    from sauna.envs.jax_native import make_jax_env
+
+    made = make_jax_env(env, env_kwargs)
+    return Probe(describe(made.observation_space, made.action_space), None)
+
+
 def _play(env: Any, seed: int) -> list[tuple[np.ndarray, float, bool]]:
     """`STEPS` steps of random actions: `(observation, reward, ended)` of each."""
     read = observation_reader(env.observation_space)

@@ -11,7 +11,7 @@ from sauna.config import Config
 from sauna.presets import Member
 
 if TYPE_CHECKING:
-    from sauna.collect.host import Collected
+    from sauna.collect.collected import Collected
     from sauna.core.types import Hypers
     from sauna.core.update import UpdateMetrics
     from sauna.member_state import Counters

@@ -1,0 +1,236 @@
+"""Training the members of one process on the device, several iterations per call.
+
+The loop of `training.py` for environments that are pure functions. What it reports, and when it
+may go on, is the same; a call runs as many iterations as are granted and ends where a checkpoint
+is due.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from sauna.collect.collected import Collected, Episode
+from sauna.config import Config
+from sauna.core.normalize import Moments
+from sauna.core.policy import Policy
+from sauna.core.population import member_keys
+from sauna.core.types import Hypers, TrainState
+from sauna.device_program import (
+    MOST_PER_CALL,
+    MemberState,
+    Population,
+    Report,
+    Setting,
+    is_sound,
+    make_mesh,
+)
+from sauna.envs.gymnasium import EnvironmentFailure
+from sauna.envs.jax_env import flat
+from sauna.envs.jax_native import make_jax_env
+from sauna.member_state import Counters, flat_params, named_params, under
+from sauna.metrics.rows import metrics_row
+from sauna.presets import Member
+from sauna.training import Job, Reporter, check_finite, goes_on
+
+Arrays = dict[str, np.ndarray]
+
+
+def train_on_device(job: Job, reporter: Reporter) -> None:
+    """Runs every iteration of the job's members, reporting each.
+
+    Raises:
+      NonFinite: an update gave a non-finite loss or parameter.
+      EnvironmentFailure: an environment gave a number that is not finite.
+    """
+    reporter.phase("making environments")
+    config = job.config
+    population = make_population(job)
+    counters = [Counters() for _ in job.members]
+    if job.restored is not None:
+        counters = _restore(job, population, job.restored)
+    reporter.phase("compiling")
+    reporter.phase(f"compiled in {population.compile():.1f} s")
+    iteration = job.start
+    while any(goes_on(config, c) for c in counters):
+        allowed = reporter.allowance(iteration)
+        if not allowed:
+            break
+        due = config.checkpoint_every - iteration % config.checkpoint_every
+        clock = time.perf_counter()
+        reports = population.run(iteration, min(allowed, due, MOST_PER_CALL))
+        seconds = time.perf_counter() - clock
+        iteration = _tell(job, reporter, iteration, reports, counters, seconds)
+        if iteration % config.checkpoint_every == 0:
+            reporter.state(iteration, pack(job, population, counters))
+    reporter.state(iteration, pack(job, population, counters))
+
+
+def make_population(job: Job) -> Population:
+    """The job's members at the start of their training."""
+    config = job.config
+    env = flat(make_jax_env(config.env, job.env_kwargs))
+    longest = max((len(rates) for rates in job.drop_rates), default=1)
+    settings = [
+        _setting(member, job.drop_rates[p] if job.drop_rates else [member.config.drop_rate], longest)
+        for p, member in enumerate(job.members)
+    ]
+    mesh = make_mesh(len(settings), config.envs, jax.devices()) if config.devices != 1 else None
+    return Population(config, job.spaces, env, settings, mesh)
+
+
+def _setting(member: Member, drop_rates: list[float], length: int) -> Setting:
+    values = {name: np.float32(getattr(member.config, name)) for name in Hypers._fields}
+    rates = drop_rates + [drop_rates[-1]] * (length - len(drop_rates))
+    hypers = Hypers(**values)  # type: ignore[arg-type]
+    return Setting(member_keys(member.seed), hypers, jnp.asarray(rates, jnp.float32))
+
+
+def _tell(
+    job: Job,
+    reporter: Reporter,
+    first: int,
+    reports: list[Report],
+    counters: list[Counters],
+    seconds: float,
+) -> int:
+    """Reports what one call ran; the iteration that comes next."""
+    ran = np.stack([report.ran for report in reports])  # [P, MOST_PER_CALL]
+    number = int(ran.any(0).sum())
+    for i in range(number):
+        rows, steps = [], 0
+        for p in np.flatnonzero(ran[:, i]):
+            report = jax.tree.map(lambda x: x[i], reports[p])  # noqa: B023
+            member = job.members[p]
+            _check_sound(member, first + i, report)
+            collected = _collected(report)
+            counters[p].add(collected)
+            steps += collected.env_steps
+            rows.append(_row(member, job.config, first + i, collected, counters[p], report))
+        timing = {"env_steps": steps, "seconds": seconds / number}
+        reporter.iteration(first + i, rows, timing)
+    return first + number
+
+
+def _check_sound(member: Member, iteration: int, report: Report) -> None:
+    if is_sound(report):
+        return
+    if report.faults.found:
+        what = "reward" if report.faults.in_reward else "observation"
+        raise EnvironmentFailure(
+            f"environment {report.faults.env} of {member.name}, iteration {iteration}, step "
+            f"{report.faults.row} of the rollout: {what} is not finite"
+        )
+    check_finite(member, iteration, report.learned)
+
+
+def _collected(report: Report) -> Collected:
+    ends = report.ends
+    episodes = [
+        Episode(
+            int(ends.env[i]),
+            float(ends.return_[i]),
+            int(ends.length[i]),
+            bool(ends.truncated[i]),
+            bool(ends.kept[i]),
+        )
+        for i in np.flatnonzero(ends.there)
+    ]
+    return Collected(
+        None, int(report.env_steps), int(report.kept_steps), int(ends.number), episodes
+    )
+
+
+def _row(
+    member: Member,
+    config: Config,
+    iteration: int,
+    collected: Collected,
+    counters: Counters,
+    report: Report,
+) -> dict[str, Any]:
+    values = {name: getattr(member.config, name) for name in Hypers._fields}
+    hypers = Hypers(**{**values, "learning_rate": report.learning_rate})
+    return metrics_row(member, config, iteration, collected, counters, report.learned, hypers)
+
+
+def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
+    """The whole state of all members, as named arrays."""
+    arrays: Arrays = {}
+    for member, state, own in zip(job.members, population.states(), counters, strict=True):
+        packed = _pack_member(population.policy, state, own)
+        arrays |= {f"{member.name}/{name}": array for name, array in packed.items()}
+    return arrays
+
+
+def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arrays:
+    learner, adam = state.learner, state.learner.optimizer
+    arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
+    arrays |= {"adam/count": adam.count, "adam/mean": adam.mu, "adam/variance": adam.nu}
+    arrays |= counters.to_arrays()
+    moments = state.collect.observation_moments
+    if isinstance(moments, Moments):  # where a trained policy looks for them
+        arrays |= {f"observation_moments/{name}": a for name, a in moments._asdict().items()}
+    arrays |= {f"collect/{name}": a for name, a in named_leaves(state.collect).items()}
+    return {name: np.array(array) for name, array in arrays.items()}
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """The arrays of a pytree by their place in it; keys as the integers they are made of."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): (
+            jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        )
+        for path, leaf in leaves
+    }
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """A tree like `example` with the arrays of `named_leaves`."""
+    names = list(named_leaves(example))
+    leaves, structure = jax.tree_util.tree_flatten(example)
+    found = [
+        jax.random.wrap_key_data(jnp.asarray(arrays[name]), impl=jax.random.key_impl(leaf))
+        if _is_key(leaf)
+        else jnp.asarray(arrays[name])
+        for name, leaf in zip(names, leaves, strict=True)
+    ]
+    return jax.tree_util.tree_unflatten(structure, found)
+
+
+def _restore(
+    job: Job, population: Population, arrays: Mapping[str, np.ndarray]
+) -> list[Counters]:
+    """Puts all members back; what they had counted."""
+    states, counters = [], []
+    for member, example in zip(job.members, population.states(), strict=True):
+        own = under(member.name + "/", arrays)
+        counted = Counters.from_arrays(own)
+        adam = optax.ScaleByAdamState(
+            jnp.asarray(own["adam/count"]),
+            jnp.asarray(own["adam/mean"]),
+            jnp.asarray(own["adam/variance"]),
+        )
+        params = flat_params(population.policy, example.learner.params, under("params/", own))
+        states.append(
+            MemberState(
+                TrainState(params, adam),
+                filled(example.collect, under("collect/", own)),
+                jnp.int32(counted.env_steps),
+                jnp.int32(counted.kept_steps),
+            )
+        )
+        counters.append(counted)
+    population.restore(states)
+    return counters

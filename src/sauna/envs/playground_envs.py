@@ -1,0 +1,27 @@
+"""MuJoCo Playground: `playground/CheetahRun`, `playground/HumanoidRun`, ..."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mujoco_playground import registry
+
+from sauna.envs.brax_like import from_brax
+from sauna.envs.jax_env import JaxEnv
+
+
+def names() -> list[str]:
+    return list(registry.ALL_ENVS)
+
+
+def make(name: str, **overrides: Any) -> JaxEnv:
+    """`overrides` are keys of the task's own config (`episode_length`, `impl="warp"`, ...)."""
+    # The JAX implementation needs no further package and runs on every machine.
+    env = registry.load(name, config_overrides={"impl": "jax", **overrides})
+    own = registry.get_default_config(name)
+    own.update(overrides)
+
+    def render(state: Any) -> Any:
+        return env.render([state])[0]
+
+    return from_brax(env, own.episode_length, own.action_repeat, render, 1.0 / env.dt)
