@@ -169,6 +169,9 @@ def _train(values: dict[str, Any]) -> None:
     env = values.pop("env")
     given |= values | ({"env": env} if env else {})
     display = make_display()
+    if runs.follows(given):
+        runs.follow(given, display)
+        return
     run = runs.start(given, display)
     runs.train(run, display, resume=False)
     print(f"learning curve: {run.path}/figures/learning_curve.png")

@@ -278,8 +278,7 @@ def lead_for(seconds: float) -> int:
 def _environment(config: Config) -> dict[str, str]:
     """What a worker's JAX has to know before it is imported."""
     if config.backend == "device" and config.device == "gpu":
-        # Others may share the GPU: memory is taken as it is needed, not three quarters at once.
-        return {"JAX_PLATFORMS": "cuda", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+        return {"JAX_PLATFORMS": "cuda"}
     return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
 
 

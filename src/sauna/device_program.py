@@ -49,6 +49,7 @@ class Setting(NamedTuple):
     keys: Keys
     hypers: Hypers  # with the learning rate before its schedule
     drop_rates: Array  # [I] of each iteration; the last counts for all later ones
+    steps: Array  # [] int32, the budget
 
 
 class Report(NamedTuple):
@@ -97,10 +98,10 @@ def iterate(
     """
     config = parts.config
     used = state.kept_steps if config.budget == "kept" else state.env_steps
-    goes_on = config.steps - used >= config.rollout_steps * config.envs
+    goes_on = setting.steps - used >= config.rollout_steps * config.envs
     limit = jnp.int32(capacity(config))
     if config.budget == "env":
-        limit = jnp.minimum(limit, (config.steps - used) // config.envs)
+        limit = jnp.minimum(limit, (setting.steps - used) // config.envs)
     limit = jnp.where(goes_on, limit, 0)
     hypers = _hypers_now(config, setting, used, iteration)
     collected, rollout, ends, faults = collect(
@@ -138,7 +139,7 @@ def _hypers_now(config: Config, setting: Setting, used: Array, iteration: Array)
     """A member's hyperparameters in this iteration: the schedule and the drop rate applied."""
     left = jnp.float32(1.0)
     if config.learning_rate_schedule == "linear":
-        left = 1.0 - used.astype(jnp.float32) / config.steps
+        left = 1.0 - used.astype(jnp.float32) / setting.steps
     rates = setting.drop_rates
     return setting.hypers._replace(
         learning_rate=setting.hypers.learning_rate * left,
@@ -236,6 +237,7 @@ class Population:
             everywhere = NamedSharding(mesh, PartitionSpec())
             self._init = jax.jit(init, out_shardings=places)
             self._run = jax.jit(run, donate_argnums=0, out_shardings=(places, everywhere))
+            self._spread = jax.jit(lambda x: x, out_shardings=places)
             self._gather = jax.jit(lambda x: x, out_shardings=everywhere)
         if together:
             self._state = self._init(self._settings)
@@ -277,9 +279,7 @@ class Population:
             self._state = states
             return
         stacked = stack(states)
-        if self._mesh is not None:
-            stacked = jax.device_put(stacked, shardings(self._mesh, stacked))
-        self._state = stacked
+        self._state = stacked if self._mesh is None else self._spread(stacked)
 
 
 def stack(trees: list[Any]) -> Any:

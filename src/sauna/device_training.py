@@ -34,6 +34,8 @@ from sauna.device_program import (
 from sauna.envs.gymnasium import EnvironmentFailure
 from sauna.envs.jax_env import flat
 from sauna.envs.jax_native import make_jax_env
+from sauna.errors import BadInput
+from sauna.machines import join, read_place, share, tell
 from sauna.member_state import Counters, flat_params, named_params, under
 from sauna.metrics.rows import metrics_row
 from sauna.presets import Member
@@ -51,20 +53,23 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     """
     reporter.phase("making environments")
     config = job.config
+    place = read_place(config.distributed)
+    join(place)
     population = make_population(job)
     counters = [Counters() for _ in job.members]
-    if job.restored is not None:
-        counters = _restore(job, population, job.restored)
+    restored = share(place, dict(job.restored or {}))
+    if restored:
+        counters = _restore(job, population, restored)
     reporter.phase("compiling")
     reporter.phase(f"compiled in {population.compile():.1f} s")
-    iteration = job.start
+    iteration = tell(place, job.start)
     while any(goes_on(config, c) for c in counters):
-        allowed = reporter.allowance(iteration)
-        if not allowed:
-            break
         due = config.checkpoint_every - iteration % config.checkpoint_every
+        number = tell(place, min(reporter.allowance(iteration), due, MOST_PER_CALL))
+        if not number:
+            break
         clock = time.perf_counter()
-        reports = population.run(iteration, min(allowed, due, MOST_PER_CALL))
+        reports = population.run(iteration, number)
         seconds = time.perf_counter() - clock
         iteration = _tell(job, reporter, iteration, reports, counters, seconds)
         if iteration % config.checkpoint_every == 0:
@@ -81,15 +86,28 @@ def make_population(job: Job) -> Population:
         _setting(member, job.drop_rates[p] if job.drop_rates else [member.config.drop_rate], longest)
         for p, member in enumerate(job.members)
     ]
-    mesh = make_mesh(len(settings), config.envs, jax.devices()) if config.devices != 1 else None
+    mesh = make_mesh(len(settings), config.envs, _devices(config))
     return Population(config, job.spaces, env, settings, mesh)
+
+
+def _devices(config: Config) -> list[Any]:
+    """Those that share the population: of all machines.
+
+    Raises:
+      BadInput: there are fewer than asked for.
+    """
+    found, wanted = jax.devices(), config.devices
+    if wanted > len(found):
+        raise BadInput(f"devices: {wanted} asked for, {len(found)} are there")
+    return found[:wanted] if wanted else found
 
 
 def _setting(member: Member, drop_rates: list[float], length: int) -> Setting:
     values = {name: np.float32(getattr(member.config, name)) for name in Hypers._fields}
     rates = drop_rates + [drop_rates[-1]] * (length - len(drop_rates))
     hypers = Hypers(**values)  # type: ignore[arg-type]
-    return Setting(member_keys(member.seed), hypers, jnp.asarray(rates, jnp.float32))
+    steps = jnp.int32(member.config.steps)
+    return Setting(member_keys(member.seed), hypers, jnp.asarray(rates, jnp.float32), steps)
 
 
 def _tell(

@@ -20,6 +20,7 @@ from sauna.coordinator import Coordinator
 from sauna.envs.native import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.errors import BadInput, one_line
+from sauna.machines import Follower, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_config
@@ -110,6 +111,35 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     return run
 
 
+def follows(given: Mapping[str, Any]) -> bool:
+    """Whether another machine writes this run.
+
+    Raises:
+      BadInput: `distributed` cannot be read.
+    """
+    return read_place(str(given.get("distributed", ""))).index > 0
+
+
+def follow(given: Mapping[str, Any], display: Display) -> None:
+    """Trains together with the machine that writes the run, until that has finished.
+
+    Raises:
+      BadInput: as `start`.
+    """
+    given = plain(given)
+    config = placed(resolve(given))
+    configure_jax(config.devices if config.device == "cpu" else 0, config.device)
+    found = look_at(config)
+    config = settle(config, found.spaces)
+    check_read_after_settling(found.spaces, config, given)
+    everyone = members(config, given)
+    from sauna.training import Job, train_members
+
+    kwargs = json.loads(config.env_kwargs)
+    job = Job(config, found.spaces, kwargs, everyone, _drop_rates(everyone), None, 0, True)
+    train_members(job, Follower(display.say))
+
+
 def placed(config: Config) -> Config:
     """Resolves where the environments run, and on what.
 
@@ -122,6 +152,7 @@ def placed(config: Config) -> Config:
         return config
     if config.env_processes:
         raise BadInput("env_processes: not read with backend device")
+    read_place(config.distributed)
     most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
     if most >= 2**31:
         raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")
@@ -202,7 +233,8 @@ def settle(config: Config, spaces: Spaces) -> Config:
         )
     number = len(config.arm) * len(config.seeds)
     processes = config.processes or os.cpu_count() or 1
-    if config.backend == "device" and (config.device == "gpu" or config.devices > 1):
+    together = config.device == "gpu" or config.devices > 1 or config.distributed
+    if config.backend == "device" and together:
         processes = 1  # one program for all members and all devices
     return dataclasses.replace(
         config,

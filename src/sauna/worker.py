@@ -68,7 +68,7 @@ def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
     try:
         header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
-        configure_jax(header["config"]["devices"])
+        configure_jax(header["config"]["devices"], _device(header["config"]))
         from sauna.training import train_members
 
         reporter = PipeReporter(inbox, outbox, dies_alone)
@@ -82,17 +82,21 @@ def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
         send(outbox, {"kind": "failure", "message": traceback.format_exc()})
 
 
-def configure_jax(simulated: int = 0) -> None:
+def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
     """One CPU thread per process, synchronous dispatch, and a compilation cache on disk.
-
-    Args:
-      simulated: with JAX_PLATFORMS=cpu, into how many devices the CPU is divided.
 
     With one thread the bits of a result do not depend on the number of cores; the small programs
     here run faster, too. A process that already used JAX keeps its own thread count.
+
+    Args:
+      simulated: on a CPU, into how many devices it is divided; 0: it is one.
+      device: cpu or gpu.
     """
-    os.environ.setdefault("PJRT_NPROC", "1")
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("JAX_PLATFORMS", {"cpu": "cpu", "gpu": "cuda"}[device])
+    if os.environ["JAX_PLATFORMS"] == "cpu":
+        os.environ.setdefault("PJRT_NPROC", "1")
+    else:  # others may share it: memory is taken as it is needed, not three quarters at once
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -102,6 +106,10 @@ def configure_jax(simulated: int = 0) -> None:
         base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         jax.config.update("jax_compilation_cache_dir", os.path.join(base, "sauna", "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def _device(config: Mapping[str, Any]) -> str:
+    return "gpu" if config["backend"] == "device" and config["device"] == "gpu" else "cpu"
 
 
 def write_job(

@@ -1,0 +1,91 @@
+"""Several machines that train together, joined by `jax.distributed`.
+
+Every machine runs the same command, but for its index, and computes its part of the same program.
+Machine 0 alone writes the run and decides how far it goes; the others are told, call by call.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sauna.errors import BadInput
+
+
+class Place(NamedTuple):
+    """Where this machine stands among the others."""
+
+    address: str  # HOST:PORT of machine 0
+    count: int
+    index: int
+
+
+ALONE = Place("", 1, 0)
+
+
+def read_place(text: str) -> Place:
+    """`HOST:PORT,COUNT,INDEX`; the empty text is one machine alone.
+
+    Raises:
+      BadInput: it is not of that form.
+    """
+    if not text:
+        return ALONE
+    address, *numbers = text.split(",")
+    if len(numbers) != 2 or not all(n.isdigit() for n in numbers) or ":" not in address:
+        raise BadInput(f"distributed: {text!r} is not HOST:PORT,COUNT,INDEX")
+    count, index = map(int, numbers)
+    if not 0 <= index < count or count < 2:
+        raise BadInput(f"distributed: index {index} of {count} machines; it counts from 0, and "
+                       f"takes at least 2")  # fmt: skip
+    return Place(address, count, index)
+
+
+def join(place: Place) -> None:
+    """Waits until all machines are there. Before anything else is asked of JAX."""
+    if place.count > 1:
+        import jax
+
+        jax.distributed.initialize(place.address, place.count, place.index)
+
+
+def tell(place: Place, number: int) -> int:
+    """What machine 0 says, on every machine."""
+    if place.count == 1:
+        return number
+    from jax.experimental.multihost_utils import broadcast_one_to_all
+
+    return int(broadcast_one_to_all(np.int32(number)))
+
+
+def share(place: Place, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Machine 0's arrays, on every machine."""
+    if place.count == 1:
+        return arrays
+    from jax.experimental.multihost_utils import broadcast_one_to_all
+    from safetensors.numpy import load, save
+
+    blob = np.frombuffer(save(arrays), np.uint8)
+    size = tell(place, len(blob))
+    room = blob if place.index == 0 else np.zeros(size, np.uint8)
+    return load(np.asarray(broadcast_one_to_all(room)).tobytes())
+
+
+class Follower:
+    """The reporter of a machine that writes nothing."""
+
+    def __init__(self, say: Any) -> None:
+        self._say = say
+
+    def phase(self, text: str) -> None:
+        self._say(text)
+
+    def allowance(self, iteration: int) -> int:
+        return 1  # machine 0 says how many
+
+    def iteration(self, iteration: int, rows: Any, timing: Any) -> None:
+        pass
+
+    def state(self, iteration: int, arrays: Any) -> None:
+        pass
