@@ -106,6 +106,10 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
     assert (dropped > 0.05) == (arm != "ppo"), "the filter had something to do"
 
 
+def _one(tree: Any, n: int) -> Any:
+    return jax.tree.map(lambda x: x[n], tree)
+
+
 def test_an_ended_episode_keeps_its_last_observation_and_the_next_begins() -> None:
     env, key = flat(walk), jax.random.key(3)
     running = begin(env, key, 4, cached=False)
@@ -118,7 +122,7 @@ def test_an_ended_episode_keeps_its_last_observation_and_the_next_begins() -> No
         ended = np.asarray(told.terminated | told.truncated)
         for n in np.flatnonzero(ended):
             seen_ends += 1
-            reached = env.step(jax.tree.map(lambda x: x[n], before.state), jnp.ones(1))
+            reached = env.step(_one(before.state, n), jnp.ones(1))
             np.testing.assert_allclose(told.observation[n], reached.observation, rtol=1e-6)
             assert running.episode[n] == before.episode[n] + 1
             assert running.observation[n, 1] == 0.0 != told.observation[n, 1]

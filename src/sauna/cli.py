@@ -83,7 +83,9 @@ def make_parser() -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
     bench.add_argument("env", nargs="?", metavar="ENV", default="HalfCheetah-v5",
                        help="default: HalfCheetah-v5")  # fmt: skip
-    bench.add_argument("--against", metavar="PEER", help="also run another trainer: sb3, cleanrl")
+    bench.add_argument(
+        "--against", metavar="PEER", help="also run another trainer: sb3, cleanrl, brax"
+    )
     text = "with --against cleanrl: your copy of its ppo_continuous_action.py"
     bench.add_argument("--script", metavar="FILE", help=text)
     bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")
@@ -278,8 +280,18 @@ def _bench(values: dict[str, Any]) -> None:
     for name in ("rounds", "iterations", "scale", "script"):
         del given[name]
     from sauna.bench.command import bench, bench_scale, report
+    from sauna.bench.device import bench_on_device, report_on_device, scale_on_device
+    from sauna.presets import resolve
+    from sauna.run import placed, plain
 
-    if values["scale"]:
+    native = placed(resolve(plain(given))).backend == "device"
+    if native and values["scale"]:
+        result = scale_on_device(given, rounds, iterations, _say)
+    elif native:
+        result = bench_on_device(given, rounds=rounds, iterations=iterations, against=against,
+                                 say=_say)  # fmt: skip
+        print("\n".join(report_on_device(result)))
+    elif values["scale"]:
         result = bench_scale({"arm": "ppo", **given}, rounds, _say)
     else:
         result = bench(given, rounds=rounds, iterations=iterations, against=against,

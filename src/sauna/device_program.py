@@ -18,12 +18,12 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from sauna.collect.collected import capacity
-from sauna.collect.device import CollectState, Collecting, Ends, Faults, collect, start
+from sauna.collect.device import Collecting, CollectState, Ends, Faults, collect, start
 from sauna.config import Config
 from sauna.core.batch import make_batch
 from sauna.core.policy import Policy, make_policy
 from sauna.core.population import Keys
-from sauna.core.types import Array, Hypers, TrainState
+from sauna.core.types import Array, Hypers, Rollout, TrainState
 from sauna.core.update import UpdateMetrics, init_state, learn
 from sauna.envs.jax_env import JaxEnv
 from sauna.selection.filters import make_filter
@@ -113,18 +113,7 @@ def iterate(
         iteration,
         limit,
     )
-    batch = make_batch(rollout, hypers, config=config, target=parts.target)
-    order = _minibatch_order(config, jax.random.fold_in(setting.keys.order, iteration))
-    learner, learned = learn(
-        state.learner,
-        rollout,
-        batch,
-        hypers,
-        order,
-        config=config,
-        policy=parts.policy,
-        target=parts.target,
-    )
+    learner, learned = learn_from(parts, state.learner, rollout, setting, hypers, iteration)
     env_steps = jnp.sum(rollout.valid, dtype=jnp.int32)
     kept_steps = jnp.sum(rollout.keep, dtype=jnp.int32)
     after = MemberState(
@@ -133,6 +122,30 @@ def iterate(
     after = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, state)
     report = Report(goes_on, env_steps, kept_steps, ends, faults, learned, hypers.learning_rate)
     return after, report
+
+
+def learn_from(
+    parts: Parts,
+    learner: TrainState,
+    rollout: Rollout,
+    setting: Setting,
+    hypers: Hypers,
+    iteration: Array,
+) -> tuple[TrainState, UpdateMetrics]:
+    """Advantages and the update."""
+    config = parts.config
+    batch = make_batch(rollout, hypers, config=config, target=parts.target)
+    order = _minibatch_order(config, jax.random.fold_in(setting.keys.order, iteration))
+    return learn(
+        learner,
+        rollout,
+        batch,
+        hypers,
+        order,
+        config=config,
+        policy=parts.policy,
+        target=parts.target,
+    )
 
 
 def _hypers_now(config: Config, setting: Setting, used: Array, iteration: Array) -> Hypers:
@@ -218,15 +231,13 @@ class Population:
             """Over the members of one program: stays a scalar, so that a branch stays a branch."""
             return jax.lax.pmax(here.astype(jnp.int32), MEMBERS) > 0 if together else here
 
-        parts = make_parts(config, spaces, env, anywhere)
+        self.parts = parts = make_parts(config, spaces, env, anywhere)
         self.policy = parts.policy
-        init, step = partial(init_member, parts), partial(iterate, parts)
+        init = self.over_members(partial(init_member, parts))
+        self._settings: Any = stack(settings) if together else settings
+        step = partial(iterate, parts)
         if together:
-            init = jax.vmap(init, axis_name=MEMBERS)
             step = jax.vmap(step, (0, 0, None), axis_name=MEMBERS)
-            self._settings: Any = stack(settings)
-        else:
-            self._settings = settings
         run = partial(several, step)
         if mesh is None:
             self._init = jax.jit(init)
@@ -244,12 +255,25 @@ class Population:
         else:
             self._state = [self._init(setting) for setting in settings]
 
+    def over_members(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function of one member as one of what a call takes: all members, or one."""
+        return function if self._one_by_one else jax.vmap(function, axis_name=MEMBERS)
+
+    def example(self) -> tuple[Any, Any]:
+        """State and setting as one call takes them; the state is the next call's to use up."""
+        if self._one_by_one:
+            return self._state[0], self._settings[0]
+        return self._state, self._settings
+
+    @property
+    def in_one_call(self) -> int:
+        """Members that one call runs."""
+        return 1 if self._one_by_one else self.number
+
     def compile(self) -> float:
         """Compiles the iteration; how many seconds that took (little where it was cached)."""
         clock = time.perf_counter()
-        state, setting = self._state, self._settings
-        if self._one_by_one:
-            state, setting = state[0], setting[0]
+        state, setting = self.example()
         self._run = self._run.lower(state, setting, np.int32(0), np.int32(0)).compile()
         return time.perf_counter() - clock
 
@@ -311,8 +335,6 @@ def shardings(mesh: Mesh, states: MemberState) -> Any:
     places = jax.tree.map(lambda _: members, states)
     per_env = ("envs", "discounted_return", "episode_return", "episode_length")
     collect = places.collect._replace(
-        **{
-            name: jax.tree.map(lambda _: envs, getattr(states.collect, name)) for name in per_env
-        }
+        **{name: jax.tree.map(lambda _: envs, getattr(states.collect, name)) for name in per_env}
     )
     return places._replace(collect=collect)

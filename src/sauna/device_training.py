@@ -83,7 +83,9 @@ def make_population(job: Job) -> Population:
     env = flat(make_jax_env(config.env, job.env_kwargs))
     longest = max((len(rates) for rates in job.drop_rates), default=1)
     settings = [
-        _setting(member, job.drop_rates[p] if job.drop_rates else [member.config.drop_rate], longest)
+        _setting(
+            member, job.drop_rates[p] if job.drop_rates else [member.config.drop_rate], longest
+        )
         for p, member in enumerate(job.members)
     ]
     mesh = make_mesh(len(settings), config.envs, _devices(config))
@@ -227,9 +229,7 @@ def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     return jax.tree_util.tree_unflatten(structure, found)
 
 
-def _restore(
-    job: Job, population: Population, arrays: Mapping[str, np.ndarray]
-) -> list[Counters]:
+def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray]) -> list[Counters]:
     """Puts all members back; what they had counted."""
     states, counters = [], []
     for member, example in zip(job.members, population.states(), strict=True):

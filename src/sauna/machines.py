@@ -17,8 +17,8 @@ class Place(NamedTuple):
     """Where this machine stands among the others."""
 
     address: str  # HOST:PORT of machine 0
-    count: int
-    index: int
+    machines: int
+    number: int  # of this one, from 0
 
 
 ALONE = Place("", 1, 0)
@@ -44,15 +44,15 @@ def read_place(text: str) -> Place:
 
 def join(place: Place) -> None:
     """Waits until all machines are there. Before anything else is asked of JAX."""
-    if place.count > 1:
+    if place.machines > 1:
         import jax
 
-        jax.distributed.initialize(place.address, place.count, place.index)
+        jax.distributed.initialize(place.address, place.machines, place.number)
 
 
 def tell(place: Place, number: int) -> int:
     """What machine 0 says, on every machine."""
-    if place.count == 1:
+    if place.machines == 1:
         return number
     from jax.experimental.multihost_utils import broadcast_one_to_all
 
@@ -61,14 +61,14 @@ def tell(place: Place, number: int) -> int:
 
 def share(place: Place, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Machine 0's arrays, on every machine."""
-    if place.count == 1:
+    if place.machines == 1:
         return arrays
     from jax.experimental.multihost_utils import broadcast_one_to_all
     from safetensors.numpy import load, save
 
     blob = np.frombuffer(save(arrays), np.uint8)
     size = tell(place, len(blob))
-    room = blob if place.index == 0 else np.zeros(size, np.uint8)
+    room = blob if place.number == 0 else np.zeros(size, np.uint8)
     return load(np.asarray(broadcast_one_to_all(room)).tobytes())
 
 

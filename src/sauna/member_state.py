@@ -53,7 +53,9 @@ class Counters:
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Named as in a checkpoint."""
         return {
-            f"counters/{key}": np.asarray(value, np.float64 if isinstance(value, list) else np.int64)
+            f"counters/{key}": np.asarray(
+                value, np.float64 if isinstance(value, list) else np.int64
+            )
             for key, value in dataclasses.asdict(self).items()
         }
 

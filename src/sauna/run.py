@@ -117,7 +117,7 @@ def follows(given: Mapping[str, Any]) -> bool:
     Raises:
       BadInput: `distributed` cannot be read.
     """
-    return read_place(str(given.get("distributed", ""))).index > 0
+    return read_place(str(given.get("distributed", ""))).number > 0
 
 
 def follow(given: Mapping[str, Any], display: Display) -> None:

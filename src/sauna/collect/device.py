@@ -344,5 +344,3 @@ def _faults(rows: _Row) -> Faults:
     row, env = jnp.unravel_index(place, bad.shape)
     in_reward = ~jnp.isfinite(rows.reward[row, env])
     return Faults(jnp.any(bad), row.astype(jnp.int32), env.astype(jnp.int32), in_reward)
-
-

@@ -17,7 +17,6 @@ import numpy as np
 from sauna.collect.actor import make_actor
 from sauna.collect.collected import Collected, Episode, capacity
 from sauna.collect.moments import ObservationMoments, discounted_returns
-from sauna.config import Config
 from sauna.core.normalize import (
     Moments,
     initial_moments,
@@ -310,7 +309,9 @@ class HostCollector:
     def _collected(self, member: int) -> Collected:
         episodes = self._finish(member)
         rollout = Rollout(*(buffer[member] for buffer in self._buffers))
-        return Collected(rollout, int(rollout.valid.sum()), int(rollout.keep.sum()), len(episodes), episodes)
+        return Collected(
+            rollout, int(rollout.valid.sum()), int(rollout.keep.sum()), len(episodes), episodes
+        )
 
     def _finish(self, member: int) -> list[Episode]:
         """Scales a member's rewards; its episodes, in the order in which they ended."""

@@ -47,7 +47,9 @@ def make(name: str, **params: Any) -> JaxEnv:
         truncated = jax.numpy.asarray(env.is_truncated(inner, fixed), bool) & ~terminated
         return Transition(State(inner, key), observation, reward, terminated, truncated)
 
-    return JaxEnv(reset, step, _space(env.observation_space(fixed)), _space(env.action_space(fixed)))
+    return JaxEnv(
+        reset, step, _space(env.observation_space(fixed)), _space(env.action_space(fixed))
+    )
 
 
 def _space(space: Any) -> gymnasium.Space:

@@ -17,7 +17,7 @@ from sauna.envs.jax_env import JaxEnv
 class HostFace(gymnasium.Env):
     """One environment, its two functions compiled for this machine's CPU."""
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(self, env: JaxEnv, render_mode: str | None = None) -> None:
         self.observation_space, self.action_space = env.observation_space, env.action_space

@@ -154,10 +154,7 @@ def advance(
     def fresh() -> tuple[State, Array]:
         return jax.vmap(env.reset)(_episode_keys(key, episode))
 
-    if running.first:
-        start = running.first
-    else:
-        start = jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
+    start = running.first or jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
     now = (running.state, running.observation)
     state, observation = _where(acting, _where(ended, start, reached), now)
     told = transition._replace(terminated=terminated, truncated=truncated)
