@@ -18,11 +18,16 @@ PRESETS: dict[str, dict[str, Any]] = {
     "mujoco": {},
     # The SAUNA authors' run script: more epochs and a constant learning rate.
     "mujoco-release": {"epochs": 15, "learning_rate_schedule": "constant"},
+    # Schulman et al. (2017) on Roboschool's Flagrun tasks: minibatches of 4096 of 512 x 32 steps.
+    # Their log-std was annealed and their step size followed the KL divergence; here the log-std
+    # is learned and the step size falls linearly, as everywhere else.
+    "flagrun": {"envs": 32, "rollout_steps": 512, "minibatches": 4, "epochs": 15},
 }
 
 PRESET_HELP = {
     "mujoco": "PPO on MuJoCo as published (Schulman et al. 2017, OpenAI baselines)",
     "mujoco-release": "the same as the SAUNA authors ran it: 15 epochs, constant learning rate",
+    "flagrun": "PPO on HumanoidFlagrunHarder: 32 actors, 512 steps each, minibatches of 4096",
 }
 
 ARMS: dict[str, dict[str, Any]] = {

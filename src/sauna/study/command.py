@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from sauna import rundir
-from sauna.envs.probe import Probe, probe
+from sauna.envs.probe import Probe
 from sauna.errors import BadInput, Interrupted
-from sauna.run import check_read_after_settling, settle
+from sauna.run import check_read_after_settling, look_at, placed, settle
 from sauna.study.local import LocalExecutor
 from sauna.study.results import gather
 from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
 from sauna.study.summary import summarize
-from sauna.study.units import Unit, seeds_per_unit, units_of
+from sauna.study.units import Unit, most_seeds, seeds_per_unit, units_of
 from sauna.study.view import StudyView
 
 COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
@@ -79,7 +79,8 @@ def study(
         raise BadInput("address: read with --on ray only")
     _check_runs(spec)
     if on == "local":
-        return _train(LocalExecutor, spec, out, command, jobs or cores(), say, command)
+        jobs = jobs or (1 if _on_gpu(spec) else cores())
+        return _train(LocalExecutor, spec, out, command, jobs, say, command)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with cluster.connected(address, jobs) as jobs:
         return _train(cluster.RayExecutor, spec, out, command, jobs, say, again)
@@ -91,19 +92,25 @@ def _check_runs(spec: Spec) -> None:
     Raises:
       BadInput: an environment or settings that cannot be used; the arm is named.
     """
-    found: dict[tuple[str, str], Probe] = {}
+    found: dict[tuple[str, ...], Probe] = {}
     for arm in spec.arms:
         for task in arm.tasks:
-            config = check(arm, task)
-            key = task, config.env_kwargs
+            config = placed(check(arm, task))
+            key = task, config.env_kwargs, config.backend
             if key not in found:
-                found[key] = probe(task, json.loads(config.env_kwargs))
+                found[key] = look_at(config)
             try:
                 settled = settle(config, found[key].spaces)
                 given = {**arm.given(task, arm.seeds), "drop_rate_from": settled.drop_rate_from}
                 check_read_after_settling(found[key].spaces, settled, given)
             except BadInput as error:
                 raise BadInput(f"arm {arm.label!r}: {error}") from None
+
+
+def _on_gpu(spec: Spec) -> bool:
+    """Whether some run takes a whole GPU, which others would only slow down."""
+    configs = (placed(check(arm, task)) for arm in spec.arms for task in arm.tasks)
+    return any(config.backend == "device" and config.device == "gpu" for config in configs)
 
 
 def _train(
@@ -149,7 +156,7 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
         if stored["study"] != spec.text:
             raise BadInput(f"study: {place} holds another study of this name; give --out")
         return int(stored["seeds_per_unit"])
-    size = seeds_per_unit(spec, jobs)
+    size = most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:

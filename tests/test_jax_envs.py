@@ -1,0 +1,169 @@
+"""Every backend of the device keeps one contract."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import make_job, train_here
+from sauna import rundir
+from sauna.envs.gymnasium import make_env
+from sauna.envs.jax_env import flat
+from sauna.envs.jax_native import make_jax_env
+from sauna.envs.probe import probe_on_device
+from sauna.errors import BadInput
+
+slow = pytest.mark.slow
+# An environment of each backend, and how long its episodes may last here.
+BACKENDS = [
+    ("jax_worlds:walk", {}, 12),
+    ("jax_worlds:make_walk", {"limit": 1e9}, 12),
+    ("gymnax/Pendulum-v1", {"max_steps_in_episode": 7}, 7),
+    ("gymnax/Breakout-MinAtar", {"max_steps_in_episode": 7}, 7),
+    ("mjx/InvertedPendulum-v5", {"time_limit": 4}, 4),
+    pytest.param("playground/CheetahRun", {"episode_length": 3}, 3, marks=slow),
+    pytest.param("brax/inverted_pendulum", {"episode_length": 4}, 4, marks=slow),
+    pytest.param("mjx/HalfCheetah-v5", {"time_limit": 3}, 3, marks=slow),
+    pytest.param("mjx/Hopper-v5", {"time_limit": 3}, 3, marks=slow),
+]
+
+
+def shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda x: (x.shape, x.dtype), tree)
+
+
+@pytest.mark.parametrize("name, kwargs, limit", BACKENDS)
+def test_a_backend_keeps_the_contract(name: str, kwargs: dict[str, Any], limit: int) -> None:
+    env = flat(make_jax_env(name, kwargs))
+    spaces = probe_on_device(name, kwargs).spaces
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    keys = jax.random.split(jax.random.key(0), 2)
+    state, observation = reset(keys)
+    assert observation.shape == (2, *spaces.observation_shape)
+    assert observation.dtype == spaces.observation_dtype
+    assert equal_trees(reset(keys), (state, observation)), "the same key, the same episode"
+    action = jnp.zeros((2, spaces.action_width), spaces.action_dtype)
+    first = step(state, action)
+    assert equal_trees(step(state, action), first), "the same action, the same step"
+    told, length = first, 1
+    while not bool((told.terminated | told.truncated)[0]):
+        assert shapes(told.state) == shapes(state), "a state of the same shapes for ever"
+        assert shapes(told.observation) == shapes(observation)
+        assert np.isfinite(told.reward).all() and np.isfinite(told.observation).all()
+        told, length = step(told.state, action), length + 1
+        assert length <= limit
+    assert not bool((told.terminated & told.truncated).any())
+    if length == limit:
+        assert bool(told.truncated[0]), "a time limit is no termination"
+
+
+def equal_trees(one: Any, other: Any) -> bool:
+    def data(x: Any) -> np.ndarray:
+        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(x) if is_key else x)
+
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.array_equal(data(a), data(b), equal_nan=True) for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    "name, tolerance",
+    [
+        ("InvertedPendulum-v5", 1e-4),
+        pytest.param("HalfCheetah-v5", 2e-2, marks=slow),
+        pytest.param("Hopper-v5", 2e-2, marks=slow),
+    ],
+)
+def test_mjx_tasks_are_gymnasiums_to_single_precision(name: str, tolerance: float) -> None:
+    """From the same state, with the same actions: observations, rewards and ends of 8 steps."""
+    ours, theirs = make_jax_env(f"mjx/{name}", {}), gymnasium.make(name)
+    step = jax.jit(ours.step)
+    state, observation = jax.jit(ours.reset)(jax.random.key(2))
+    theirs.reset(seed=0)
+    bare = theirs.unwrapped
+    bare.set_state(np.asarray(state.qpos, float), np.asarray(state.qvel, float))
+    rng = np.random.default_rng(0)
+    assert ours.action_space == theirs.action_space
+    for _ in range(8):
+        action = rng.uniform(-1, 1, theirs.action_space.shape).astype(np.float32)
+        told = step(state, action)
+        expected = theirs.step(action)
+        np.testing.assert_allclose(told.observation, expected[0], atol=tolerance, rtol=tolerance)
+        np.testing.assert_allclose(told.reward, expected[1], atol=tolerance, rtol=tolerance)
+        assert bool(told.terminated) == expected[2]
+        state = told.state
+    assert not np.allclose(expected[0], observation, atol=10 * tolerance), "it has moved"
+
+
+def test_the_host_face_is_an_ordinary_environment() -> None:
+    env = make_env("gymnax/CartPole-v1", {"max_steps_in_episode": 9})
+    spaces = env.observation_space, env.action_space
+    assert isinstance(spaces[0], gymnasium.spaces.Box) and spaces[1] == gymnasium.spaces.Discrete(2)
+    played = []
+    for _ in range(2):
+        seen = [env.reset(seed=5)[0]]
+        for i in range(9):
+            observation, reward, terminated, truncated, _ = env.step(i % 2)
+            assert isinstance(reward, float) and spaces[0].contains(observation)
+            seen.append(observation)
+        assert truncated and not terminated
+        played.append(np.stack(seen))
+    np.testing.assert_array_equal(*played)
+    unseeded = env.reset()[0]
+    assert not np.array_equal(unseeded, played[0][0])
+
+
+def test_a_missing_backend_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(BadInput, match=r"pip install 'sauna-rl\[playground\]'"):
+        make_jax_env("playground/CheetahRun", {})
+
+
+def test_unknown_names_and_arguments_are_bad_input() -> None:
+    with pytest.raises(BadInput, match="CartPole-v1"):
+        make_jax_env("gymnax/CartPole-v2", {})
+    with pytest.raises(BadInput, match="no parameter 'gravty'"):
+        make_jax_env("gymnax/CartPole-v1", {"gravty": 3})
+    with pytest.raises(BadInput, match="takes none"):
+        make_jax_env("jax_worlds:walk", {"limit": 3})
+
+
+CARTPOLE = {"envs": 8, "rollout_steps": 128, "minibatches": 4, "epochs": 8, "hidden": "64,64",
+            "learning_rate": 1e-3, "steps": 200_000, "seeds": 10}  # fmt: skip
+
+
+@pytest.mark.parametrize("arm", ["ppo", "sauna"])
+def test_ten_members_solve_cartpole(arm: str) -> None:
+    """Gymnasium calls CartPole-v1 solved at a mean return of 475 of 500 over 100 episodes."""
+    recorder = train_here(make_job("gymnax/CartPole-v1", arm=arm, **CARTPOLE))
+    best: dict[int, float] = {}
+    for row in recorder.rows:
+        best[row["seed"]] = max(best.get(row["seed"], 0.0), row.get("return_mean", 0.0))
+    assert len(best) == 10
+    assert min(best.values()) > 475, best
+
+
+@pytest.mark.parametrize("env", ["playground/CheetahRun"])
+def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path) -> None:
+    """As a user would; XLA is told not to optimise, which would take longer than the training."""
+    run = tmp_path / "run"
+    command = [sys.executable, "-m", "sauna", "train", env, "--threshold", "0.9", "--envs", "4",
+               "--rollout-steps", "8", "--minibatches", "2", "--hidden", "8", "--steps", "128",
+               "--reset", "cached", "--out", str(run)]  # fmt: skip
+    variables = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    done = subprocess.run(command, env=variables, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "compiled in" in done.stdout
+    rows = rundir.rows(run)
+    assert 32 < rows[-1]["env_steps"] <= 128
+    assert all(np.isfinite(row["value_loss"]) for row in rows)
