@@ -88,7 +88,13 @@ def make_population(job: Job) -> Population:
         )
         for p, member in enumerate(job.members)
     ]
-    mesh = make_mesh(len(settings), config.envs, _devices(config))
+    devices = _devices(config)
+    mesh = make_mesh(len(settings), config.envs, devices)
+    if config.distributed and (mesh is None or mesh.size < len(devices)):
+        raise BadInput(
+            f"distributed: {len(settings)} members of {config.envs} environments cannot be shared "
+            f"evenly over {len(devices)} devices"
+        )
     return Population(config, job.spaces, env, settings, mesh)
 
 
