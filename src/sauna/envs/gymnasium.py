@@ -20,6 +20,7 @@ import numpy as np
 from sauna.config import import_name
 from sauna.envs.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.native import is_native
+from sauna.envs.flagrun import register
 from sauna.errors import BadInput, SaunaError, nearest, one_line
 from sauna.spaces import action_writer, describe, observation_reader
 
@@ -54,6 +55,8 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
             importlib.import_module(module)
         except Exception as error:
             raise BadInput(f"env: cannot import {module!r}: {one_line(error)}") from error
+    if name.startswith("sauna/"):
+        register()  # an installed package's entry point does so too; a source tree has none
     if name not in gymnasium.registry:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
     if "mujoco" in str(gymnasium.registry[name].entry_point):
