@@ -7,6 +7,7 @@ import sys
 from functools import cache
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -44,7 +45,7 @@ def seed_of(z: float) -> int:
 
 
 def test_gymnasium_accepts_the_environment() -> None:
-    env = env_maker(ID, {})()
+    env = gymnasium.make(f"sauna.envs.flagrun:{ID}")
     check_env(env.unwrapped, skip_render_check=True)
     assert env.observation_space.shape == (44,) and env.action_space.shape == (17,)
     assert env.metadata["render_fps"] == 61
