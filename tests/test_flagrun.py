@@ -1,6 +1,6 @@
 """HumanoidFlagrunHarder: the task's constants and rules, by hand and against a plain restatement.
 
-The second half of `test_flagrun_faces.py` holds the environments made of it.
+`test_flagrun_faces.py` tests the environments that are made of it.
 """
 
 from __future__ import annotations

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from sauna.envs.backend import in_process_envs
 from sauna.envs.flagrun import ID
 from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.host import HumanoidFlagrunHarder
 from sauna.envs.flagrun.physics import anatomy, first_qpos, load_model, read_robot
-from sauna.envs.gymnasium import env_maker
+from sauna.envs.gymnasium import GymnasiumEnvs, env_maker
 from sauna.envs.jax_env import JaxEnv
 from sauna.envs.probe import probe
 from sauna.errors import BadInput
@@ -65,6 +66,22 @@ def test_an_episode_follows_from_its_seed_and_actions() -> None:
     assert play(first, seed, 400) == play(second, seed, 400)
     assert play(first, seed + 1, 3) != play(second, seed, 3)
     assert probe(ID, {}).differs is None
+
+
+def test_a_restored_environment_goes_on_bit_for_bit() -> None:
+    envs, again = (in_process_envs(ID, {}, [(3, 0)], "auto") for _ in range(2))
+    assert type(envs) is GymnasiumEnvs
+    rng, active = np.random.default_rng(8), np.ones(1, bool)
+    actions = rng.normal(0, 0.7, (260, 1, 17)).astype(np.float32)
+    envs.reset(), again.reset()
+    for action in actions[:230]:  # into the second episode
+        step = envs.step(action, active)
+    np.testing.assert_array_equal(again.restore(0, envs.snapshot(0)), step.observation[0])
+    for action in actions[230:]:
+        one, two = envs.step(action, active), again.step(action, active)
+        for a, b in zip(one[:4], two[:4], strict=True):
+            assert a.tobytes() == b.tobytes()
+    assert envs.snapshot(0)["episode"] == 1
 
 
 def test_actions_are_clipped_to_1() -> None:
@@ -240,11 +257,13 @@ def test_a_reset_on_the_device_is_the_hosts() -> None:
 def test_a_step_on_the_device_is_the_hosts() -> None:
     """From states along eight episodes, one control step each: MuJoCo against MJX.
 
-    Contacts make the step sensitive to float32: nine steps of ten must agree closely, not all.
+    Contacts make a step sensitive to float32: nine steps of ten must agree closely, not all.
     """
     env = device_env()
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
     state, _ = reset(jax.random.split(jax.random.key(0), 8))
+    soon = jnp.full(8, 115, jnp.int32)  # the next cube flies before the robots fall
+    state = state._replace(task=state.task._replace(frame=soon))
     rng, apart, rewards, thrown = np.random.default_rng(7), [], [], 0
     for _ in range(180):
         action = rng.uniform(-1, 1, (8, 17)).astype(np.float32)
@@ -259,8 +278,10 @@ def test_a_step_on_the_device_is_the_hosts() -> None:
                 apart.append(np.abs(observation - after.observation[i]).max())
                 rewards.append(abs(reward - float(after.reward[i])))
         state = after.state
-    assert len(apart) > 1300 and thrown
-    assert np.quantile(apart, 0.5) < 1e-4 and np.quantile(apart, 0.9) < 1e-2
+    assert len(apart) > 1000 and thrown
+    print(f"observations apart: {np.quantile(apart, [0.5, 0.9, 0.99, 1.0])}, "
+          f"rewards: {np.quantile(rewards, [0.5, 0.9, 0.99, 1.0])}")  # fmt: skip
+    assert np.quantile(apart, 0.5) < 1e-4 and np.quantile(apart, 0.9) < 3e-2
     assert np.quantile(rewards, 0.5) < 5e-3 and np.quantile(rewards, 0.9) < 5e-2
     shapes = jax.tree.map(lambda a, b: (a.shape, a.dtype) == (b.shape, b.dtype), state, after.state)
     assert all(jax.tree.leaves(shapes)) and step._cache_size() == 1
