@@ -153,13 +153,13 @@ def test_ten_members_solve_cartpole(arm: str) -> None:
     assert min(best.values()) > 475, best
 
 
-@pytest.mark.parametrize("env", ["playground/CheetahRun"])
+@pytest.mark.parametrize("env", ["playground/CheetahRun", "sauna/HumanoidFlagrunHarder-v0"])
 def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path) -> None:
     """As a user would; XLA is told not to optimise, which would take longer than the training."""
     run = tmp_path / "run"
     command = [sys.executable, "-m", "sauna", "train", env, "--threshold", "0.9", "--envs", "4",
                "--rollout-steps", "8", "--minibatches", "2", "--hidden", "8", "--steps", "128",
-               "--reset", "cached", "--out", str(run)]  # fmt: skip
+               "--reset", "cached", "--backend", "device", "--out", str(run)]  # fmt: skip
     variables = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
     done = subprocess.run(command, env=variables, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -20,7 +20,6 @@ import numpy as np
 from sauna.config import import_name
 from sauna.envs.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.native import is_native
-from sauna.envs.flagrun import register
 from sauna.errors import BadInput, SaunaError, nearest, one_line
 from sauna.spaces import action_writer, describe, observation_reader
 

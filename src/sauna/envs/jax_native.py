@@ -20,7 +20,7 @@ from sauna.errors import BadInput, nearest, one_line
 # What each backend's package is called where it is imported.
 PACKAGES = {"gymnax": "gymnax", "playground": "mujoco_playground", "brax": "brax",
             "mjx": "mujoco.mjx"}  # fmt: skip
-HOST_ENVS = {"sauna/HumanoidFlagrunHarder-v0": "sauna.envs.flagrun:make_jax_env"}
+HOST_ENVS = {"sauna/HumanoidFlagrunHarder-v0": "sauna.envs.flagrun.device:flagrun_mjx"}
 
 
 def make_jax_env(env: str, env_kwargs: dict[str, Any]) -> JaxEnv:
