@@ -236,12 +236,16 @@ def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
         ({"env": "jax_worlds:walk", "env_processes": 1}, "env_processes: not read"),
         ({"env": "InvertedPendulum-v5", "reset": "cached"}, "reset: only read"),
         ({"env": "gymnax/CartPol-v1"}, "CartPole-v1"),
+        ({"env": "jax_worlds:walk", "device": "gpu"}, "device: no NVIDIA GPU"),
         ({"env": "jax_worlds:walk", "steps": 3_000_000_000}, "steps: the device counts"),
     ],
 )
-def test_bad_input_is_refused(settings: dict[str, Any], message: str) -> None:
+def test_bad_input_is_refused(
+    settings: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from sauna import run
     from sauna.metrics.display import PlainDisplay
 
+    monkeypatch.setattr(run, "has_gpu", lambda: False)
     with pytest.raises(BadInput, match=message):
         run.start({**SMALL, **settings}, PlainDisplay())

@@ -157,6 +157,9 @@ def placed(config: Config) -> Config:
     if most >= 2**31:
         raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")
     device = config.device
+    if device == "gpu" and not has_gpu():
+        raise BadInput("device: no NVIDIA GPU here that JAX can use; "
+                       "`pip install 'sauna-rl[gpu]'` where there is one")  # fmt: skip
     if device == "auto":
         device = "gpu" if has_gpu() else "cpu"
     return dataclasses.replace(config, device=device)
