@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -249,3 +250,11 @@ def test_bad_input_is_refused(
     monkeypatch.setattr(run, "has_gpu", lambda: False)
     with pytest.raises(BadInput, match=message):
         run.start({**SMALL, **settings}, PlainDisplay())
+
+
+def test_the_environment_of_the_docs_trains(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (Path(__file__).parent.parent / "docs" / "device.md").read_text()
+    (tmp_path / "my_envs.py").write_text(text.split("```python\n")[1].split("```")[0])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    result = train_here(make_job("my_envs:near_zero", arm="sauna", envs=2))
+    assert result.rows[-1]["env_steps"] == 128

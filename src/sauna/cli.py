@@ -311,7 +311,10 @@ def _list(values: dict[str, Any]) -> None:
     if what == "envs":
         import gymnasium
 
-        for name in sorted(gymnasium.registry):
+        import sauna.envs.flagrun  # noqa: F401 - registers it
+        from sauna.envs.jax_native import installed
+
+        for name in [*sorted(gymnasium.registry), *installed()]:
             print(name)
     elif what == "studies":
         from sauna.study.spec import built_in

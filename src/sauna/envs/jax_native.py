@@ -49,6 +49,16 @@ def make_jax_env(env: str, env_kwargs: dict[str, Any]) -> JaxEnv:
     return thing
 
 
+def installed() -> list[str]:
+    """The names of all environments whose backend is installed."""
+    found: list[str] = []
+    for backend in NATIVE:
+        if _is_installed(backend):
+            module = importlib.import_module(f"sauna.envs.{backend}_envs")
+            found += [f"{backend}/{name}" for name in sorted(module.names())]
+    return found
+
+
 def _known() -> str:
     return ", ".join([*HOST_ENVS, *(f"{backend}/..." for backend in NATIVE), "module:name"])
 
@@ -62,11 +72,13 @@ def _made(env: str, make: Callable[[], Any]) -> Any:
         raise BadInput(f"env: {env} cannot be made: {one_line(error)}") from error
 
 
-def _check_installed(backend: str) -> None:
-    package = PACKAGES[backend]
+def _is_installed(backend: str) -> bool:
     try:
-        found = importlib.util.find_spec(package) is not None
+        return importlib.util.find_spec(PACKAGES[backend]) is not None
     except ModuleNotFoundError:  # of a parent package
-        found = False
-    if not found:
+        return False
+
+
+def _check_installed(backend: str) -> None:
+    if not _is_installed(backend):
         raise BadInput(f"env: {backend} is not installed; `pip install 'sauna-rl[{backend}]'`")
