@@ -272,7 +272,7 @@ class Coordinator:
 
 def lead_for(seconds: float) -> int:
     """Iterations to grant where one takes `seconds`: a call to the device runs many short ones."""
-    return int(min(max(SECONDS_AHEAD / seconds, LEAD), MOST_AHEAD))
+    return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MOST_AHEAD))
 
 
 def _environment(config: Config) -> dict[str, str]:

@@ -201,8 +201,9 @@ def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arra
     arrays |= {"adam/count": adam.count, "adam/mean": adam.mu, "adam/variance": adam.nu}
     arrays |= counters.to_arrays()
     moments = state.collect.observation_moments
-    if isinstance(moments, Moments):  # where a trained policy looks for them
-        arrays |= {f"observation_moments/{name}": a for name, a in moments._asdict().items()}
+    if isinstance(moments, Moments):  # where a trained policy looks for them, and as the host's
+        for name, array in moments._asdict().items():
+            arrays[f"observation_moments/{name}"] = np.asarray(array, np.float64)
     arrays |= {f"collect/{name}": a for name, a in named_leaves(state.collect).items()}
     return {name: np.array(array) for name, array in arrays.items()}
 

@@ -152,7 +152,8 @@ def placed(config: Config) -> Config:
         return config
     if config.env_processes:
         raise BadInput("env_processes: not read with backend device")
-    read_place(config.distributed)
+    if read_place(config.distributed).machines > 1 and config.devices:
+        raise BadInput("devices: not read with distributed, where every device takes part")
     most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
     if most >= 2**31:
         raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")

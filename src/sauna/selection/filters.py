@@ -116,9 +116,7 @@ def sauna_joint(history: str, quota: int) -> Filter:
         state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
     ) -> tuple[History, Array]:
         kept = informative(jnp.mean(vex), state, hypers.threshold)
-        seen = state
-        for n in range(vex.shape[0]):
-            seen = insert(seen, vex[n])
+        seen = jax.lax.fori_loop(0, len(vex), lambda n, history: insert(history, vex[n]), state)
         if history == "kept":
             seen = jax.tree.map(lambda new, old: jnp.where(kept, new, old), seen, state)
         return seen, jnp.broadcast_to(kept, vex.shape)

@@ -80,7 +80,7 @@ def flagrun_mjx() -> JaxEnv:
             painters.append(Painter(model))
         return painters[0].draw(np.asarray(state.qpos), np.asarray(state.task.flag))
 
-    return JaxEnv(reset, step, *spaces(np.float32), render, 1 / rules.CONTROL_DT)
+    return JaxEnv(reset, step, *spaces(), render, 1 / rules.CONTROL_DT)
 
 
 def _as_float32(value: Any) -> Any:

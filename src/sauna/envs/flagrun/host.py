@@ -21,7 +21,7 @@ from sauna.envs.flagrun.picture import Painter
 
 
 class HumanoidFlagrunHarder(gymnasium.Env):
-    """The task on MuJoCo, in double precision.
+    """The task on MuJoCo, in double precision; observations are rounded to single.
 
     An episode follows from the seed of its reset and its actions. `info` holds the reward's terms.
     """
@@ -33,7 +33,7 @@ class HumanoidFlagrunHarder(gymnasium.Env):
 
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode
-        self.observation_space, self.action_space = spaces(np.float64)
+        self.observation_space, self.action_space = spaces()
         self.model = load_model()
         self.data = mujoco.MjData(self.model)
         self._anatomy = anatomy(self.model)
@@ -48,7 +48,7 @@ class HumanoidFlagrunHarder(gymnasium.Env):
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = first_qpos(np, start)
         self.task, observation = rules.begin(np, self._robot(), start.flag)
-        return observation, {}
+        return observation.astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         draws = self.np_random.random(rules.STEP_DRAWS)
@@ -62,7 +62,8 @@ class HumanoidFlagrunHarder(gymnasium.Env):
             self.data.qpos[:], self.data.qvel[:] = qpos, qvel
         terms = {name: float(value) for name, value in outcome.reward._asdict().items()}
         ends = bool(outcome.terminated), bool(outcome.truncated)
-        return outcome.observation, sum(terms.values()), *ends, terms
+        observation = outcome.observation.astype(np.float32)
+        return observation, sum(terms.values()), *ends, terms
 
     def _robot(self) -> rules.Robot:
         # `mj_step` leaves bodies where they were before its last substep.

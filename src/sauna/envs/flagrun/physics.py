@@ -92,9 +92,9 @@ def after_throw(xp: Any, thrown: Throw, qpos: Array, qvel: Array) -> tuple[Array
     return xp.where(thrown.now, placed, qpos), xp.where(thrown.now, sent, qvel)
 
 
-def spaces(dtype: Any) -> tuple[Any, Any]:
-    """The observation and the action space."""
+def spaces() -> tuple[Any, Any]:
+    """The observation and the action space, of both faces."""
     from gymnasium.spaces import Box
 
-    observation = Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (OBSERVATIONS,), dtype)
+    observation = Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (OBSERVATIONS,), np.float32)
     return observation, Box(-1.0, 1.0, (JOINTS,), np.float32)
