@@ -16,6 +16,7 @@ import pytest
 
 from helpers import SMALL
 from sauna import rundir
+from sauna.api import compare
 from sauna.errors import BadInput
 from sauna.presets import ARMS
 from sauna.study.command import COMPARED, comparison
@@ -185,15 +186,26 @@ def test_random_drop_takes_the_rates_of_the_same_seeds(compared: Path) -> None:
             assert [1 - rate for rate in given] == pytest.approx(rates["sauna", seed])
 
 
-def test_running_again_repeats_nothing(compared: Path) -> None:
-    def stamps() -> dict[Path, int]:
-        files = (compared / "units").rglob("*/*")
-        return {path: path.stat().st_mtime_ns for path in files if path.is_file()}
+def stamps(out: Path) -> dict[Path, int]:
+    files = (out / "units").rglob("*/*")
+    return {path: path.stat().st_mtime_ns for path in files if path.is_file()}
 
-    before = stamps()
+
+def test_running_again_repeats_nothing(compared: Path) -> None:
+    before = stamps(compared)
     done = sauna("compare", "worlds:Scripted", "--out", str(compared), *FLAGS)
     assert done.returncode == 0
-    assert stamps() == before
+    assert stamps(compared) == before
+
+
+def test_python_finds_what_the_command_made(compared: Path) -> None:
+    before = stamps(compared)
+    summary = compare("worlds:Scripted", seeds=4, out=compared, processes=2, quiet=True, **QUICK)
+    assert stamps(compared) == before
+    place = next(p for p in compared.iterdir() if p.name.startswith("compare_"))
+    assert json.loads((place / "summary.json").read_text()) == summary
+    with pytest.raises(BadInput, match="env: other processes cannot import it"):
+        compare(lambda: None, out=compared)
 
 
 @pytest.mark.slow

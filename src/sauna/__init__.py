@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sauna.api import Result, load, resume, train
+    from sauna.api import Result, compare, load, resume, train
     from sauna.envs.jax_env import JaxEnv, Transition
     from sauna.errors import BadInput, SaunaError
     from sauna.evaluation import evaluate
@@ -15,12 +15,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = ["BadInput", "Filter", "JaxEnv", "Result", "SaunaError", "Transition", "VexTarget",
-           "evaluate", "load", "resume", "train"]  # fmt: skip
+           "compare", "evaluate", "load", "resume", "train"]  # fmt: skip
 
 _HOMES = {
     "BadInput": "sauna.errors",
     "SaunaError": "sauna.errors",
     "Result": "sauna.api",
+    "compare": "sauna.api",
     "load": "sauna.api",
     "resume": "sauna.api",
     "train": "sauna.api",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,49 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
     run = runs.start(given, display)
     runs.train(run, display, resume=False)
     return Result(run.path)
+
+
+def compare(
+    env: Any,
+    *,
+    arms: Sequence[str] = ("ppo", "vex-head", "random-drop", "sauna"),
+    out: str | Path = "runs",
+    processes: int = 0,
+    quiet: bool = False,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Does filtering help on `env`? Trains the arms and says what the data support.
+
+    The same as `sauna compare`: called again, it continues where it was stopped.
+
+    Args:
+      env: a Gymnasium id, `module:function`, or a function that another process can import.
+      arms: what to compare; the first is the baseline.
+      out: the folder of runs and results.
+      processes: trainings at a time; 0: one per core.
+      quiet: show nothing.
+      **settings: of every run (`seeds=6`, `steps=1_000_000`).
+
+    Returns:
+      the summary: its `table`, its `verdicts`; `report.html` beside it is the same to look at.
+
+    Raises:
+      BadInput: something is not usable; nothing was created.
+    """
+    from sauna.presets import parse_all
+    from sauna.study.command import compare_command, comparison, study
+
+    given = {"env": name_of(env), **settings}
+    for name in PARTS:
+        if name in given:
+            given[name] = name_of(given[name])
+            if given[name].startswith(local.__name__ + ":"):
+                raise BadInput(f"{name}: other processes cannot import it; put it into a module")
+    task = given.pop("env")
+    spec = comparison(task, tuple(arms), parse_all(given))
+    command = compare_command(task, tuple(arms), given)
+    say = _Silent().say if quiet else make_display().say
+    return study(spec, Path(out), command, processes, say)
 
 
 def resume(

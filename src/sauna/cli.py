@@ -229,17 +229,14 @@ def _whole(values: dict[str, Any], name: str, least: int) -> int:
 
 
 def _compare(values: dict[str, Any]) -> None:
-    from sauna.study.command import comparison
-    from sauna.study.results import typed
+    from sauna.study.command import compare_command, comparison
 
-    env, arms = values.pop("env"), values.pop("arms")
+    env, arms = values.pop("env"), tuple(values.pop("arms").split(","))
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
-    flags = "".join(f" {typed(name, value)}" for name, value in values.items())
-    values = {"seeds": 6, **parse_all(values)}
-    spec = comparison(env, tuple(arms.split(",")), values)
-    _run_study(spec, f"sauna compare {env} --arms {arms}{flags}", **place)
+    spec = comparison(env, arms, parse_all(values))
+    _run_study(spec, compare_command(env, arms, values), **place)
 
 
 def _study(values: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from sauna.envs.probe import Probe
 from sauna.errors import BadInput, Interrupted
 from sauna.run import check_read_after_settling, look_at, placed, settle
 from sauna.study.local import LocalExecutor
-from sauna.study.results import gather
+from sauna.study.results import gather, typed
 from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
 from sauna.study.summary import summarize
@@ -24,6 +24,7 @@ from sauna.study.units import Unit, most_seeds, seeds_per_unit, units_of
 from sauna.study.view import StudyView
 
 COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+SEEDS = 6  # of a comparison, where none are given
 
 
 def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
@@ -35,11 +36,18 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     rules = {}
     if "sauna-reference" in arms:  # beside it the others take its rules, so that the filter differs
         rules = {"truncation": "terminate", "budget": "env"}
-    values = {"tasks": [env], "arms": [{"label": arm} for arm in arms], **rules, **settings}
+    arms_of = [{"label": arm} for arm in arms]
+    values = {"tasks": [env], "arms": arms_of, "seeds": SEEDS, **rules, **settings}
     text = json.dumps(values, sort_keys=True, default=list)
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     return read_spec({"name": f"compare_{place}_{digest}", "baseline": arms[0], **values})
+
+
+def compare_command(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> str:
+    """What a user types to make the same comparison again."""
+    flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
+    return f"sauna compare {env} --arms {','.join(arms)}{flags}"
 
 
 def study(
