@@ -213,7 +213,12 @@ def test_presets_are_the_published_numbers() -> None:
     changed = {n for n in FIELDS if getattr(release, n) != getattr(config, n)}
     assert changed == {"preset", "epochs", "learning_rate_schedule"}
     assert (release.epochs, release.learning_rate_schedule) == (15, "constant")
-    assert set(PRESETS) == {"mujoco", "mujoco-release"}
+    flagrun = resolve({"env": "x", "arm": "ppo", "preset": "flagrun"})
+    changed = {n for n in FIELDS if getattr(flagrun, n) != getattr(config, n)}
+    assert changed == {"preset", "envs", "rollout_steps", "minibatches", "epochs"}
+    assert (flagrun.rollout_steps, flagrun.envs, flagrun.epochs) == (512, 32, 15)
+    assert flagrun.rollout_steps * flagrun.envs // flagrun.minibatches == 4096
+    assert set(PRESETS) == {"mujoco", "mujoco-release", "flagrun"}
 
 
 def test_arms_are_the_options_table() -> None:

@@ -256,5 +256,5 @@ def test_the_environment_of_the_docs_trains(tmp_path, monkeypatch: pytest.Monkey
     text = (Path(__file__).parent.parent / "docs" / "device.md").read_text()
     (tmp_path / "my_envs.py").write_text(text.split("```python\n")[1].split("```")[0])
     monkeypatch.syspath_prepend(str(tmp_path))
-    result = train_here(make_job("my_envs:near_zero", arm="sauna", envs=2))
+    result = train_here(make_job("my_envs:near_zero", arm="ppo", envs=2))
     assert result.rows[-1]["env_steps"] == 128

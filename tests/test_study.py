@@ -104,7 +104,7 @@ def test_studies_of_the_paper(name: str) -> None:
     arms = {arm.label: arm for arm in spec.arms}
     for arm in spec.arms:
         config = check(arm, spec.tasks[0])
-        assert config.steps == 10**6
+        assert config.steps == (10**8 if name.startswith("fig4") else 10**6)
         # Only the filter may differ from the baseline: the same rules of truncation and budget.
         if arm.baseline and not arm.label.startswith("ppo"):
             base = check(arms[arm.baseline], spec.tasks[0])
@@ -114,6 +114,17 @@ def test_studies_of_the_paper(name: str) -> None:
     if name == "fig3":
         assert {a.arm for a in spec.arms} == set(ARMS)
         assert {len(a.seeds) for a in spec.arms} == {6} and len(spec.tasks) == 6
+
+
+def test_the_papers_three_settings_of_flagrun() -> None:
+    found = {}
+    for name in ("fig4a", "fig4b", "fig4c"):
+        config = check(load_spec(name).arms[0], "sauna/HumanoidFlagrunHarder-v0")
+        assert config.backend == "device" and config.rollout_steps == 512
+        assert config.envs * config.rollout_steps // config.minibatches == 4096
+        found[name] = (config.hidden, config.envs)
+    wide = (512, 256, 128)
+    assert found == {"fig4a": ((64, 64), 32), "fig4b": (wide, 32), "fig4c": (wide, 128)}
 
 
 def test_units_share_folders_with_equal_settings_and_follow_their_source() -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 from sauna import local, rundir
 from sauna import run as runs
-from sauna.config import name_of
 from sauna.errors import BadInput
 from sauna.metrics.display import Display, PlainDisplay, make_display
+from sauna.names import name_of
 
 PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
 
