@@ -42,7 +42,7 @@ def play(env: Any, seed: int, steps: int) -> list[tuple]:
 def seed_of(z: float) -> int:
     """A seed whose episode begins at this height."""
     env = HumanoidFlagrunHarder()
-    return next(s for s in range(50) if abs(env.reset(seed=s)[0][0] + 0.8 - z) < 1e-9)
+    return next(s for s in range(50) if abs(env.reset(seed=s)[0][0] + 0.8 - z) < 1e-6)
 
 
 def test_gymnasium_accepts_the_environment() -> None:
@@ -51,6 +51,13 @@ def test_gymnasium_accepts_the_environment() -> None:
     assert env.observation_space.shape == (44,) and env.action_space.shape == (17,)
     assert env.metadata["render_fps"] == 61
     env.close()
+
+
+def test_both_faces_have_the_same_spaces() -> None:
+    ours, theirs = HumanoidFlagrunHarder(), device_env()
+    assert str(ours.observation_space) == str(theirs.observation_space)
+    assert str(ours.action_space) == str(theirs.action_space)
+    assert ours.reset(seed=0)[0].dtype == ours.observation_space.dtype
 
 
 def test_a_name_that_is_close_is_named() -> None:
