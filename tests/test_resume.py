@@ -200,7 +200,7 @@ def test_lost_rows_are_noticed(tmp_path) -> None:
     run = finished(tmp_path)
     make_incomplete(run, 2)
     os.truncate(run / "metrics.jsonl", 10)
-    with pytest.raises(BadInput, match="rows are lost"):
+    with pytest.raises(checkpoint.BadCheckpoint, match="rows are lost"):
         sauna.resume(run, quiet=True)
 
 

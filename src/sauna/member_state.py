@@ -16,6 +16,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
+from sauna.checkpoint import BadCheckpoint
 from sauna.collect.host import Collected, HostCollector
 from sauna.core.normalize import Moments
 from sauna.core.policy import Policy
@@ -63,8 +64,25 @@ def flat_params(policy: Policy, example: jax.Array, named: Mapping[str, np.ndarr
     """The inverse of `named_params`; `example` is any parameter vector of the policy."""
     tree = policy.unravel(example)
     structure = jax.tree_util.tree_structure(tree)
-    leaves = [jnp.asarray(named[name]) for name in named_params(policy, example)]
+    leaves = [
+        jnp.asarray(fitting(named, name, leaf))
+        for name, leaf in named_params(policy, example).items()
+    ]
     return ravel_pytree(jax.tree_util.tree_unflatten(structure, leaves))[0]
+
+
+def fitting(stored: Mapping[str, np.ndarray], name: str, place: np.ndarray) -> np.ndarray:
+    """A stored array, if it is there and fits where it belongs.
+
+    Raises:
+      BadCheckpoint: it is missing, or of another shape or type.
+    """
+    array = stored.get(name)
+    if array is None or (array.shape, array.dtype) != (place.shape, place.dtype):
+        found = "missing" if array is None else f"{array.dtype}{list(array.shape)}"
+        expected = f"{place.dtype}{list(place.shape)}"
+        raise BadCheckpoint(f"checkpoint: {name} is {found}; this network and run need {expected}")
+    return array
 
 
 def pack_member(
@@ -111,10 +129,11 @@ def unpack_member(
       NotRestored: a replayed environment shows another observation than the stored one.
     """
     own = under(name + "/", arrays)
+    moment = np.asarray(example.params)
     adam = optax.ScaleByAdamState(
-        jnp.asarray(own["adam/count"]),
-        jnp.asarray(own["adam/mean"]),
-        jnp.asarray(own["adam/variance"]),
+        jnp.asarray(fitting(own, "adam/count", np.asarray(example.optimizer.count))),
+        jnp.asarray(fitting(own, "adam/mean", moment)),
+        jnp.asarray(fitting(own, "adam/variance", moment)),
     )
     state = TrainState(flat_params(policy, example.params, under("params/", own)), adam)
     counters = Counters(
@@ -124,10 +143,10 @@ def unpack_member(
         }
     )
     for key, place in moments_of(collector, p).items():
-        place[...] = own[key]
+        place[...] = fitting(own, key, place)
     if replay:
         for key, place in collected_of(collector, p).items():
-            place[...] = own[key]
+            place[...] = fitting(own, key, place)
     collect = collector.state
     number = len(collect.observation[p])
     for n in range(number):

@@ -158,14 +158,14 @@ def _check_same_program(arm: str, config: Config, shared: Config) -> None:
 
 
 def stored_config(stored: Mapping[str, Any]) -> Config:
-    """The config that `config.to_json` wrote.
+    """The config that `config.to_json` wrote, perhaps before some fields existed.
+
+    A field that is missing has its default: whoever adds one sees to it that its default is what
+    was done before.
 
     Raises:
-      BadInput: a key is unknown or missing, or a value cannot be read.
+      BadInput: a key is unknown, or a value cannot be read.
     """
-    missing = [name for name in FIELDS if name not in stored]
-    if missing:
-        raise BadInput(f"config: {missing[0]!r} is missing")
     return Config(**parse_all(stored))
 
 

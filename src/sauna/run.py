@@ -17,7 +17,7 @@ from sauna import checkpoint, rundir
 from sauna.config import Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe, probe
-from sauna.errors import BadInput, one_line
+from sauna.errors import BadInput, SaunaError, one_line
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_config
@@ -94,6 +94,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     }
     rundir.create(path)
     run = Run(path, given, config, found, drop_rates)
+    rundir.create(path)  # again, now that it is ours: another process may have been faster
     rundir.write_json(path / "config.json", stored)
     if found.differs:
         display.say(
@@ -229,28 +230,59 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
             if rundir.is_complete(run.path):
                 display.say(f"{run.path} is complete; nothing to do")
                 return
-            loaded = checkpoint.load_newest(run.path / "checkpoints", display.say)
-            _check_same(run, loaded)
+            loaded = _load(run, display)
             rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
         with Coordinator(run, display, loaded, inexact) as coordinator:
             coordinator.run()
+    except BrokenPipeError:  # of our own output: nobody reads it any more
+        raise
+    except OSError as error:
+        raise SaunaError(
+            f"cannot write {error.filename or run.path}: {error.strerror}; the last good "
+            f"checkpoint is kept, continue with: sauna resume {run.path}"
+        ) from error
     finally:
         run.held.close()
 
 
-def _check_same(run: Run, loaded: checkpoint.Checkpoint | None) -> None:
+def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
+    """The newest checkpoint that is good, of this run, and whose rows are all there.
+
+    Raises:
+      BadInput: a checkpoint is of another run or environment; each field that differs is named.
+      BadCheckpoint: there are checkpoints, but none can be used.
+    """
+    own = run.manifest()
+
+    def check(manifest: dict[str, Any]) -> None:
+        _check_same(run.path, own, manifest)
+        rundir.check_logs(run.path, manifest["logs"])
+
+    loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
+    before = loaded.manifest.get("versions", {}) if loaded else {}
+    changed = [f"{name} {before[name]} -> {own['versions'].get(name)}" for name in before
+               if before[name] != own["versions"].get(name)]  # fmt: skip
+    if changed:
+        display.say(f"warning: other versions than when the checkpoint was saved "
+                    f"({', '.join(changed)}): the rest may differ in its last bits")  # fmt: skip
+    return loaded
+
+
+def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> None:
     """Refuses a checkpoint that another config or environment wrote.
 
     Raises:
-      BadInput: with the first field that differs.
+      BadInput: with every field that differs.
     """
-    if loaded is None:
-        return
-    own = run.manifest()
-    for name, value in own["config"].items():
-        stored = loaded.manifest["config"].get(name)
-        if name not in (*RESUMABLE, "out") and stored != value:
-            raise BadInput(f"{loaded.path} is of another run: {name} is {stored!r}, not {value!r}")
+    stored = {**to_json(Config()), **manifest["config"]}  # a field added since had its default
+    differing = [
+        f"{name} is {stored[name]!r}, not {value!r}"
+        for name, value in own["config"].items()
+        if name not in (*RESUMABLE, "out") and stored[name] != value
+    ]
     for name in ("spaces", "members"):
-        if loaded.manifest[name] != json.loads(json.dumps(own[name])):
-            raise BadInput(f"{loaded.path} is of another environment or run: {name} differ")
+        if manifest[name] != json.loads(json.dumps(own[name])):
+            differing.append(f"{name} differ")
+    if differing:
+        raise BadInput(f"{path}: its checkpoint is of another run or environment: "
+                       f"{'; '.join(differing)}")  # fmt: skip

@@ -17,11 +17,13 @@ import json
 import os
 import platform
 import subprocess
+import time
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.checkpoint import sync_folder, write_durably
+from sauna.checkpoint import BadCheckpoint, sync_folder, write_durably
 from sauna.errors import BadInput
+from sauna.untrusted import JSON_BYTES, Untrusted, parse_object, read_file
 
 LOGS = ("metrics.jsonl", "timing.jsonl")
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
@@ -68,14 +70,28 @@ def lock(path: Path) -> IO[str]:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        file.seek(0)
-        holder = file.read().strip() or "unknown"
+        holder = _holder(file)
         file.close()
         raise InUse(f"{path} is in use by process {holder}") from None
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()
     return file
+
+
+def _holder(file: IO[str]) -> str:
+    """The number that the holder writes into the lock right after it has it.
+
+    Until then the file is empty or names the holder before, which may have been killed.
+    """
+    number = ""
+    for _ in range(100):
+        file.seek(0)
+        number = file.read().strip()
+        if number.isdigit() and Path(f"/proc/{number}").exists():
+            break
+        time.sleep(0.005)
+    return number or "unknown"
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -105,12 +121,9 @@ def read_config_file(path: Path) -> dict[str, Any]:
       BadInput: the file cannot be read as that.
     """
     try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        return parse_object(read_file(path.resolve(), JSON_BYTES))
+    except Untrusted as error:
         raise BadInput(f"config: cannot read {path}: {error}") from error
-    if not isinstance(value, dict):
-        raise BadInput(f"config: {path} does not hold a JSON object")
-    return value
 
 
 def rows(run: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
@@ -137,18 +150,26 @@ def log_sizes(run: Path) -> dict[str, int]:
     return {name: (run / name).stat().st_size for name in LOGS if (run / name).exists()}
 
 
-def cut_logs(run: Path, sizes: dict[str, int]) -> None:
-    """Brings the logs back to a checkpoint: rows behind it will be written again.
+def check_logs(run: Path, sizes: dict[str, int]) -> None:
+    """Whether the logs still hold the rows that a checkpoint counts on.
 
     Raises:
-      BadInput: a log is shorter than the checkpoint says; rows were lost.
+      BadCheckpoint: a log is shorter than the checkpoint says; rows were lost.
     """
     for name in LOGS:
         path, size = run / name, sizes.get(name, 0)
         if (path.stat().st_size if path.exists() else 0) < size:
-            raise BadInput(f"{path} is shorter than when the checkpoint was saved; rows are lost")
+            raise BadCheckpoint(
+                f"{path} is shorter than when the checkpoint was saved; rows are lost"
+            )
+
+
+def cut_logs(run: Path, sizes: dict[str, int]) -> None:
+    """Brings the logs back to a checkpoint: rows behind it will be written again."""
+    for name in LOGS:
+        path = run / name
         if path.exists():
-            os.truncate(path, size)
+            os.truncate(path, sizes.get(name, 0))
 
 
 def versions() -> dict[str, str]:
