@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from sauna.errors import SaunaError
@@ -150,9 +151,9 @@ def load_checkpoint(
         if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
             raise Untrusted("state.safetensors is not what was written (SHA-256 differs)")
         check_tensors(blob)
-    except Untrusted as error:
+        return Checkpoint(path, manifest, load(blob))
+    except (Untrusted, SafetensorError) as error:
         raise BadCheckpoint(f"{path}: {error}") from error
-    return Checkpoint(path, manifest, load(blob))
 
 
 def _manifest(path: Path) -> dict[str, Any]:
@@ -184,8 +185,9 @@ def _check_types(manifest: dict[str, Any]) -> None:
             manifest.setdefault(name, kind())
         if type(manifest.get(name)) is not kind:
             raise Untrusted(f"manifest.json: {name} is missing or of another type")
-    if not all(type(size) is int and size >= 0 for size in manifest["logs"].values()):
-        raise Untrusted("manifest.json: logs are no sizes")
+    for name, size in manifest["logs"].items():
+        if Path(name).name != name or type(size) is not int or size < 0:
+            raise Untrusted("manifest.json: logs are not names of files and their sizes")
 
 
 def load_newest(

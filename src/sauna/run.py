@@ -9,7 +9,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -92,10 +93,15 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
         "git": rundir.git_revision(),
         "machine": rundir.machine(),
     }
-    rundir.create(path)
-    run = Run(path, given, config, found, drop_rates)
-    rundir.create(path)  # again, now that it is ours: another process may have been faster
-    rundir.write_json(path / "config.json", stored)
+    with _disk_errors(path):
+        rundir.create(path)
+        run = Run(path, given, config, found, drop_rates)
+        try:
+            rundir.create(path)  # again, now that it is ours: another may have been faster
+            rundir.write_json(path / "config.json", stored)
+        except BaseException:
+            run.held.close()
+            raise
     if found.differs:
         display.say(
             f"warning: {config.env} does not repeat itself ({found.differs}): this run can be "
@@ -107,6 +113,20 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
             f"in this process, and can be resumed only from Python, passing the same again"
         )
     return run
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """What the system says of a file becomes one line, with what to do next."""
+    try:
+        yield
+    except BrokenPipeError:  # of our own output: nobody reads it any more
+        raise
+    except OSError as error:
+        again = "; the last good checkpoint is kept, continue with: sauna resume "
+        hint = f"{again}{path}" if (path / "config.json").exists() else ""
+        place = error.filename or path
+        raise SaunaError(f"cannot read or write {place}: {error.strerror}{hint}") from error
 
 
 def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
@@ -189,7 +209,8 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
         raise BadInput(f"{config.env} has other spaces than when the run started: "
                        f"{found.spaces} instead of {stored['spaces']}")  # fmt: skip
-    return Run(path, dict(given), config, found, stored["drop_rates"])
+    with _disk_errors(path):
+        return Run(path, dict(given), config, found, stored["drop_rates"])
 
 
 def _drop_rates(everyone: list[Member]) -> list[list[float]]:
@@ -225,24 +246,22 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
       SaunaError: something failed; the last good checkpoint is on disk.
     """
     try:
-        loaded = None
-        if resume:
-            if rundir.is_complete(run.path):
-                display.say(f"{run.path} is complete; nothing to do")
-                return
-            loaded = _load(run, display)
-            rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
-        with Coordinator(run, display, loaded, inexact) as coordinator:
-            coordinator.run()
-    except BrokenPipeError:  # of our own output: nobody reads it any more
-        raise
-    except OSError as error:
-        raise SaunaError(
-            f"cannot write {error.filename or run.path}: {error.strerror}; the last good "
-            f"checkpoint is kept, continue with: sauna resume {run.path}"
-        ) from error
+        with _disk_errors(run.path):
+            _train(run, display, resume, inexact)
     finally:
         run.held.close()
+
+
+def _train(run: Run, display: Display, resume: bool, inexact: bool) -> None:
+    loaded = None
+    if resume:
+        if rundir.is_complete(run.path):
+            display.say(f"{run.path} is complete; nothing to do")
+            return
+        loaded = _load(run, display)
+        rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+    with Coordinator(run, display, loaded, inexact) as coordinator:
+        coordinator.run()
 
 
 def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:

@@ -69,13 +69,16 @@ def lock(path: Path) -> IO[str]:
     file = (path / ".lock").open("a+")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+    except BlockingIOError:
         holder = _holder(file)
         file.close()
         raise InUse(f"{path} is in use by process {holder}") from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
+    except OSError:
+        file.close()
+        raise
     return file
 
 

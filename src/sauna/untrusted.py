@@ -37,16 +37,18 @@ def read_file(path: Path, limit: int) -> bytes:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
         raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
-    with os.fdopen(descriptor, "rb") as file:
+    try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise Untrusted(f"{path.name} is not a regular file")
         if status.st_size > limit:
             raise Untrusted(f"{path.name} has {status.st_size} bytes; at most {limit} are expected")
-        try:
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
             return file.read(limit + 1)
-        except OSError as error:
-            raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
+    except OSError as error:
+        raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
+    finally:
+        os.close(descriptor)
 
 
 def parse_object(data: bytes) -> dict[str, Any]:

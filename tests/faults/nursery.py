@@ -93,8 +93,14 @@ class Nursery:
             stdout=subprocess.PIPE, text=True, env=environment(),
         )  # fmt: skip
 
-    def start(self, arguments: list[str], log: Path) -> Process:
-        return Forked(self, self.ask({"start": arguments, "log": str(log)})["pid"], log)
+    def start(self, arguments: list[str], log: Path, at: float = 0.0, silence: float = 300.0
+              ) -> Process:  # fmt: skip
+        """Starts `sauna ARGUMENTS`; not before `time.monotonic()` is `at`.
+
+        `silence` stands in for `watch.SILENCE`.
+        """
+        question = {"start": arguments, "log": str(log), "at": at, "silence": silence}
+        return Forked(self, self.ask(question)["pid"], log)
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -207,7 +213,7 @@ def _close_all_but(*kept: int) -> None:
                 pass
 
 
-def _run(arguments: list[str], log: str) -> None:
+def _run(arguments: list[str], log: str, at: float, silence: float) -> None:
     """The forked process: `sauna ARGUMENTS`, then its end."""
     os.setsid()
     out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -216,9 +222,10 @@ def _run(arguments: list[str], log: str) -> None:
         os.dup2(source, target)
     _close_all_but()
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    from sauna import cli, coordinator
+    from sauna import cli, coordinator, watch
 
-    coordinator.start_worker = _fork_worker
+    coordinator.start_worker, watch.SILENCE = _fork_worker, silence
+    time.sleep(max(0.0, at - time.monotonic()))
     code = 0
     try:
         cli.main(arguments)
@@ -252,7 +259,7 @@ def main() -> None:
         if "start" in question:
             pid = os.fork()
             if pid == 0:
-                _run(question["start"], question["log"])
+                _run(question["start"], question["log"], question["at"], question["silence"])
             answers.write(json.dumps({"pid": pid}) + "\n")
         else:
             code = _wait(question["wait"], question["seconds"])
