@@ -40,6 +40,10 @@ class BadCheckpoint(SaunaError):
     """A checkpoint that cannot be trusted; the message names it and says why."""
 
 
+class NewerFormat(SaunaError):
+    """A checkpoint of a version that is newer than this one: an older one must not replace it."""
+
+
 class NotFinite(SaunaError):
     """A state that must not be saved, because something in it is NaN or infinite."""
 
@@ -141,7 +145,8 @@ def load_checkpoint(
     `check(manifest)` may refuse it before its tensors are read.
 
     Raises:
-      BadCheckpoint: a file is missing, cut short or changed, or of another format.
+      BadCheckpoint: a file is missing, cut short or changed.
+      NewerFormat: only a newer version can read it.
     """
     try:
         manifest = _manifest(path)
@@ -160,16 +165,17 @@ def _manifest(path: Path) -> dict[str, Any]:
     """The manifest, brought to today's format.
 
     Raises:
-      Untrusted: it is not what was written, or of a format that is not known.
+      Untrusted: it is not what was written, or of a format that never was.
+      NewerFormat: only a newer version can read it.
     """
     stored = parse_object(read_file(path / "manifest.json", JSON_BYTES))
     number = stored.get("format")
-    if type(number) is int and number > FORMAT:
-        raise Untrusted(f"of format {number}; this version reads up to {FORMAT}: use a newer one")
-    if type(number) is not int or (number != FORMAT and number not in MIGRATIONS):
-        raise Untrusted(f"not a checkpoint of format {FORMAT}")
     if _digest(stored) != stored.get("manifest_sha256"):
         raise Untrusted("manifest.json is not what was written (SHA-256 differs)")
+    if type(number) is int and number > FORMAT:
+        raise NewerFormat(f"{path} is of format {number}; this version reads up to {FORMAT}")
+    if type(number) is not int or (number != FORMAT and number not in MIGRATIONS):
+        raise Untrusted(f"not a checkpoint of format {FORMAT}")
     while number < FORMAT:
         stored, number = MIGRATIONS[number](stored), number + 1
     _check_types(stored)
