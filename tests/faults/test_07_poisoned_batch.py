@@ -28,8 +28,8 @@ VALUES = (np.nan, np.inf, -np.inf)
 class _Learner:
     """One compiled update of a small network, with a good batch to spoil."""
 
-    def __init__(self) -> None:
-        job = make_job("worlds:Scripted", arm="sauna")
+    def __init__(self, **settings: int) -> None:
+        job = make_job("worlds:Scripted", arm="sauna", **settings)
         self.config = job.config
         self.program: Program = make_program(job.config, job.spaces)
         rng, number = np.random.default_rng(0), job.config.rollout_steps
@@ -123,6 +123,15 @@ def test_the_run_stops_and_the_last_finite_checkpoint_is_kept(
     found = checkpoint.load_newest(run / "checkpoints", print)
     assert found is not None and found.manifest["iteration"] == 2 == len(rundir.rows(run))
     assert all(np.isfinite(a).all() for a in found.arrays.values())
+
+
+def test_parameters_are_checked_where_the_loss_was_still_finite() -> None:
+    """One minibatch: its loss is computed before the step that spoils the parameters."""
+    learner = _Learner(minibatches=1, epochs=1)
+    state, finite = learner.learn(
+        learner.batch, learner.hypers._replace(learning_rate=np.float32(np.nan))
+    )
+    assert not finite and not _is_finite(state)
 
 
 def test_a_rate_that_overflows_stops_before_anything_is_saved() -> None:
