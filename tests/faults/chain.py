@@ -30,8 +30,9 @@ class Reference:
 
     def __init__(self, start: Start, run: Path, iterations: int) -> None:
         self.steps = 32 * iterations
-        arguments = train_arguments(run, steps=self.steps)
-        process = start([*arguments, "--keep-checkpoints=100000"], run.with_suffix(".log"))
+        every = {"checkpoint-every": 1, "keep-checkpoints": 100_000}
+        arguments = train_arguments(run, steps=self.steps, **every)
+        process = start(arguments, run.with_suffix(".log"))
         assert process.wait(PATIENCE) == 0, process.said()
         self.metrics = (run / "metrics.jsonl").read_bytes()
         self.states = {

@@ -204,7 +204,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / "src"
         shutil.copytree(ROOT / "src", copy, ignore=shutil.ignore_patterns("__pycache__"))
-        assert _failing_test(copy, EVERY) is None, "the tests fail on the sources as they are"
+        broken = _failing_test(copy, EVERY)
+        assert broken is None, f"{broken} fails on the sources as they are"
         found = [_try(mutant, copy) for mutant in chosen]
     caught = sum(row["caught_by"] is not None for row in found)
     alike = sum(row["equivalent"] is not None for row in found)
