@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,15 @@ SMALL = {
     "steps": 128,
     "seeds": 1,
 }
+
+
+TESTS = str(Path(__file__).parent)
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds the environments of `worlds.py`."""
+    path = [TESTS, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
 class Recorder:
