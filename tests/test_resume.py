@@ -146,3 +146,11 @@ def test_where_too_many_rows_were_lost_it_is_said(tmp_path) -> None:
     os.truncate(run / "metrics.jsonl", 10)
     with pytest.raises(checkpoint.BadCheckpoint, match="rows are lost"):
         sauna.resume(run, quiet=True)
+
+
+def test_new_folders_are_flushed_into_those_that_were_there(tmp_path, monkeypatch) -> None:
+    """Else a power cut could take a run with all of its checkpoints."""
+    flushed: list[Path] = []
+    monkeypatch.setattr(rundir, "sync_folder", flushed.append)
+    rundir.create(tmp_path / "runs" / "first")
+    assert flushed == [tmp_path / "runs", tmp_path]

@@ -45,10 +45,16 @@ def create(path: Path) -> None:
     if path.exists() and (not path.is_dir() or any(map(_counts, path.iterdir()))):
         hint = f"; `sauna resume {path}` continues it" if (path / "config.json").exists() else ""
         raise BadInput(f"out: {path} is not empty{hint}")
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {path}: {error.strerror}") from error
+    for folder in made:
+        try:
+            sync_folder(folder.parent)
+        except PermissionError:  # of a folder that may be entered, but not read
+            continue
 
 
 def _counts(path: Path) -> bool:
