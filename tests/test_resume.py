@@ -12,7 +12,7 @@ import pytest
 import sauna
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna import checkpoint, rundir
-from sauna.errors import BadInput
+from sauna.errors import BadInput, SaunaError
 from worlds import Scripted
 
 WORLD = "worlds:Scripted"
@@ -154,3 +154,12 @@ def test_new_folders_are_flushed_into_those_that_were_there(tmp_path, monkeypatc
     monkeypatch.setattr(rundir, "sync_folder", flushed.append)
     rundir.create(tmp_path / "runs" / "first")
     assert flushed == [tmp_path / "runs", tmp_path]
+
+
+def test_rows_end_where_a_power_cut_has_spoilt_them_and_a_complete_run_says_so(tmp_path) -> None:
+    log = tmp_path / "metrics.jsonl"
+    log.write_bytes(b'{"a": 1}\n\0\0\0"b": 2}\n{"c": 3}\n{"d"')
+    assert rundir.rows(tmp_path) == [{"a": 1}]
+    rundir.write_json(tmp_path / "summary.json", {"complete": True})
+    with pytest.raises(SaunaError, match=r"metrics\.jsonl: line 2 is damaged"):
+        rundir.rows(tmp_path)

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna.checkpoint import BadCheckpoint, sync_folder, write_durably
-from sauna.errors import BadInput
+from sauna.errors import BadInput, SaunaError
 from sauna.untrusted import JSON_BYTES, Untrusted, parse_object, read_file
 
 LOGS = ("metrics.jsonl", "timing.jsonl")
@@ -136,17 +136,32 @@ def read_config_file(path: Path) -> dict[str, Any]:
 
 
 def rows(run: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
-    """All rows of a log; an unfinished last line (of a run in progress) is left out."""
+    """All rows of a log; an unfinished last line (of a run in progress) is left out.
+
+    So is everything behind a line that a power cut has spoilt: a resume cuts that off.
+
+    Raises:
+      SaunaError: a row of a complete run cannot be read; its line is named.
+    """
     path = run / name
+    found: list[dict[str, Any]] = []
     if not path.is_file():
-        return []
-    return [json.loads(line) for line in path.read_text().splitlines(True) if line.endswith("\n")]
+        return found
+    for number, line in enumerate(path.read_bytes().splitlines(True), 1):
+        try:
+            if line.endswith(b"\n"):
+                found.append(json.loads(line))
+        except ValueError as error:
+            if is_complete(run):
+                raise SaunaError(f"{path}: line {number} is damaged: {error}") from error
+            break
+    return found
 
 
 def is_complete(run: Path) -> bool:
     """Whether the run was trained to its end."""
     path = run / "summary.json"
-    return path.is_file() and bool(json.loads(path.read_text())["complete"])
+    return path.is_file() and bool(read_config_file(path).get("complete"))
 
 
 def log_sizes(run: Path) -> dict[str, int]:

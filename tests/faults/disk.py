@@ -267,9 +267,15 @@ def _survivors(node: _Node) -> list[dict[str, _Node]]:
 
 
 def _remains(node: _Node) -> list[bytes]:
-    """What may be in a file that was not flushed: old, new, cut short, or blocks of zeros."""
-    size = len(node.data)
-    return [node.safe_data, node.data, node.data[: size // 2], bytes(size)]
+    """What may be in a file that was not flushed: what was, what is, or a part of it.
+
+    Of bytes that were added behind flushed ones only the added ones are at risk.
+    """
+    safe = node.safe_data if node.data.startswith(node.safe_data) else b""
+    new = node.data[len(safe) :]
+    cuts = sorted({len(new) * part // 8 for part in (1, 2, 4, 6)} | {len(new) - 1})
+    parts = [new[:cut] for cut in cuts] + [new[:cut] + bytes(len(new) - cut) for cut in cuts]
+    return [node.safe_data, node.data, safe + bytes(len(new)), *(safe + part for part in parts)]
 
 
 def _tree(root: _Node, entries: Callable[..., Any], data: Callable[..., bytes]) -> Tree:

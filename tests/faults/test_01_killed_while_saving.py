@@ -94,10 +94,15 @@ def states(before: Tree, ops: list[Op], rng: random.Random, most: int) -> Iterat
             yield done, done > durable, tree
         if done < len(ops):
             if ops[done].kind == "write":
-                cut = Disk(disk.now())
-                cut.apply(ops[done]._replace(data=ops[done].data[: len(ops[done].data) // 3]))
-                yield done, False, cut.now()
+                for part in range(1, 8):
+                    cut = Disk(disk.now())
+                    cut.apply(ops[done]._replace(data=ops[done].data[: _share(ops[done], part)]))
+                    yield done, False, cut.now()
             disk.apply(ops[done])
+
+
+def _share(op: Op, eighths: int) -> int:
+    return len(op.data) * eighths // 8
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
@@ -105,7 +110,7 @@ def experiment(least: int, seed: int, place: Path) -> Result:
     rng, tally = random.Random(seed), Tally()
     with patch("os.fsync", lambda descriptor: None):
         cases = [recorded(scenario, place / scenario.__name__) for scenario in SCENARIOS]
-        most = max(1, least // (len(cases) * 6))
+        most = max(1, least // (len(cases) * 2))
         for scenario, (before, ops, old) in zip(SCENARIOS, cases, strict=True):
             for done, must_be_new, tree in states(before, ops, rng, most):
                 tally.count(f"states of {scenario.__name__}")
