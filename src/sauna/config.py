@@ -373,8 +373,7 @@ def import_name(key: str, path: str) -> Any:
     """
     module_name, _, attribute = path.partition(":")
     if module_name.partition(".")[0] in sys.stdlib_module_names:
-        # A stored config names what is called: `os:system` must not be among it.
-        raise BadInput(f"{key}: {module_name!r} is a part of Python, not of a project of yours")
+        raise BadInput(f"{key}: {module_name!r} is a part of Python, which no run may call")
     if "" not in sys.path and str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:

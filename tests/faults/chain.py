@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -39,6 +38,23 @@ class Reference:
             int(path.name): (path / "state.safetensors").read_bytes()
             for path in checkpoint.numbered(run / "checkpoints")
         }
+
+
+class Stage:
+    """A nursery, and the reference that all runs of it are compared with."""
+
+    def __init__(self, place: Path, iterations: int = 400) -> None:
+        self.nursery = Nursery()
+        self.reference = Reference(self.nursery.start, place / "whole", iterations)
+
+    def chain(self, run: Path, tally: Tally) -> Chain:
+        return Chain(run, self.reference, self.nursery.start, tally)
+
+    def __enter__(self) -> Stage:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.nursery.close()
 
 
 class Chain:
@@ -162,7 +178,3 @@ def send(pid: int, number: int) -> None:
         os.kill(pid, number)
     except ProcessLookupError:
         pass
-
-
-__all__ = ["Chain", "Nursery", "Reference", "children", "is_saving", "orphans", "send", "signal",
-           "wait_for_rows", "wait_until"]  # fmt: skip

@@ -205,7 +205,8 @@ def main() -> int:
         copy = Path(place) / "src"
         shutil.copytree(ROOT / "src", copy, ignore=shutil.ignore_patterns("__pycache__"))
         broken = _failing_test(copy, EVERY)
-        assert broken is None, f"{broken} fails on the sources as they are"
+        log = (copy.parent / "log").read_text()[-3000:]
+        assert broken is None, f"{broken} fails on the sources as they are\n{log}"
         found = [_try(mutant, copy) for mutant in chosen]
     caught = sum(row["caught_by"] is not None for row in found)
     alike = sum(row["equivalent"] is not None for row in found)
@@ -272,13 +273,24 @@ def _test(copy: Path, tests: tuple[str, ...], log: Path) -> None:
     os.environ["PYTHONPATH"] = str(copy)
     sys.path[:0] = [str(copy), str(ROOT / "tests")]
     sys.dont_write_bytecode = True
+    _same_examples_each_time()
     files = [f"tests/{t}.py" if "/" in t else f"tests/test_{t}.py" for t in tests]
     code = 1
     try:
-        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=no", *files]))
+        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=short", *files]))
     finally:
         sys.stdout.flush()
         os._exit(code)
+
+
+def _same_examples_each_time() -> None:
+    """A mutant must not be caught by luck, nor by a machine that is slow."""
+    from hypothesis import HealthCheck, settings
+
+    settings.register_profile(
+        "mutants", derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+    )
+    settings.load_profile("mutants")
 
 
 if __name__ == "__main__":

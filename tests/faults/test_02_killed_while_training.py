@@ -3,50 +3,38 @@
 from __future__ import annotations
 
 import random
+import signal
 import time
 from pathlib import Path
 
-from faults.chain import (
-    Chain,
-    Nursery,
-    Reference,
-    children,
-    is_saving,
-    orphans,
-    send,
-    signal,
-    wait_for_rows,
-    wait_until,
-)
+from faults.chain import Chain, Stage, children, is_saving, orphans, send, wait_for_rows, wait_until
 from faults.result import Result, Tally, assert_held
 
 AIMS = ("save", "save", "rows", "start")
-ITERATIONS = 400
+CHAIN = 25  # kills of one run
 
 
-def experiment(
-    kills: int, seed: int, place: Path, chain_length: int = 25, iterations: int = ITERATIONS
-) -> Result:
-    """Kills runs again and again, in chains of `chain_length` kills of one run.
+def experiment(kills: int, seed: int, place: Path) -> Result:
+    """Kills runs again and again, in chains of 25 kills of one run.
 
     A third of the kills hit the coordinator alone, whose workers then have to end by themselves;
     every tenth process is started as a user starts it. `worst`: seconds from a resume's start to
     its first new row.
     """
+    with Stage(place) as stage:
+        return _kill_again_and_again(stage, kills, seed, place)
+
+
+def _kill_again_and_again(stage: Stage, kills: int, seed: int, place: Path) -> Result:
     rng, tally = random.Random(seed), Tally()
-    with Nursery() as nursery:
-        reference = Reference(nursery.start, place / "whole", iterations)
-        chain = Chain(place / "run", reference, nursery.start, tally)
-        in_chain = 0
-        while tally.tried < kills:
-            fresh = tally.tried % 10 == 9
-            if _kill(chain, rng, tally, fresh):
-                in_chain += 1
-            if in_chain == chain_length or chain.is_complete() or tally.tried == kills:
-                if not chain.is_complete():
-                    chain.finish()
-                tally.notes["longest chain"] = max(tally.notes.get("longest chain", 0), in_chain)
-                chain, in_chain = Chain(place / "run", reference, nursery.start, tally), 0
+    chain, in_chain = stage.chain(place / "run", tally), 0
+    while tally.tried < kills:
+        in_chain += _kill(chain, rng, tally, fresh=tally.tried % 10 == 9)
+        if in_chain == CHAIN or chain.is_complete() or tally.tried == kills:
+            if not chain.is_complete():
+                chain.finish()
+            tally.notes["longest chain"] = max(tally.notes.get("longest chain", 0), in_chain)
+            chain, in_chain = stage.chain(place / "run", tally), 0
     return tally.result()
 
 
@@ -81,6 +69,5 @@ def _kill(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> bool:
     return True
 
 
-def test_killed_at_any_moment_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    result = experiment(3, 1, tmp_path, iterations=60)
-    assert_held(result, 3)
+def test_killed_at_any_moment_it_goes_on_to_the_same_bytes(stage: Stage, tmp_path: Path) -> None:
+    assert_held(_kill_again_and_again(stage, 3, 1, tmp_path), 3)

@@ -17,7 +17,7 @@ import numpy as np
 from faults.chain import (
     PATIENCE,
     Chain,
-    Reference,
+    Stage,
     children,
     is_alive,
     orphans,
@@ -25,7 +25,6 @@ from faults.chain import (
     train_arguments,
     wait_for_rows,
 )
-from faults.nursery import Nursery
 from faults.result import Result, Tally, assert_held
 from sauna.envs.contract import episode_seed
 from sauna.envs.gymnasium import EnvironmentFailure
@@ -125,19 +124,18 @@ def _until_named(
 
 def _training_processes(number: int, rng: random.Random, place: Path, tally: Tally) -> None:
     """A training process of a run, or an environment worker of it, is killed or stopped."""
-    with Nursery() as nursery:
-        reference = Reference(nursery.start, place / "whole", 200)
-        chain = Chain(place / "run", reference, nursery.start, tally)
+    with Stage(place, iterations=200) as stage:
+        chain = stage.chain(place / "run", tally)
         for _ in range(number):
             what = rng.choice(["SIGKILL", "SIGSTOP", "coordinator"])
-            arguments = train_arguments(chain.run, steps=reference.steps, processes=2)
+            arguments = train_arguments(chain.run, steps=stage.reference.steps, processes=2)
             if (chain.run / "config.json").exists():
                 arguments = ["resume", str(chain.run), "--processes=2"]
-            process = nursery.start(arguments, chain.run.with_suffix(".log"), silence=4.0)
+            process = stage.nursery.start(arguments, chain.run.with_suffix(".log"), silence=4.0)
             wait_for_rows(chain, process, rng.randrange(1, 8000))
             _strike_run(chain, process, what, rng, tally)
             if chain.is_complete():
-                chain = Chain(place / "run", reference, nursery.start, tally)
+                chain = stage.chain(place / "run", tally)
         chain.finish()
 
 

@@ -3,41 +3,33 @@
 from __future__ import annotations
 
 import random
+import signal
 import time
 from pathlib import Path
 
-from faults.chain import (
-    PATIENCE,
-    Chain,
-    Nursery,
-    Reference,
-    children,
-    orphans,
-    send,
-    signal,
-    wait_for_rows,
-)
+from faults.chain import PATIENCE, Chain, Stage, children, orphans, send, wait_for_rows
 from faults.result import Result, Tally, assert_held
 from sauna import checkpoint
 
-ITERATIONS = 400
 
-
-def experiment(signals: int, seed: int, place: Path, iterations: int = ITERATIONS) -> Result:
+def experiment(signals: int, seed: int, place: Path) -> Result:
     """Stops runs with SIGINT and SIGTERM at random moments, one in four twice.
 
     `worst`: seconds from the first signal to the end of the process.
     """
+    with Stage(place) as stage:
+        return _stop_again_and_again(stage, signals, seed, place)
+
+
+def _stop_again_and_again(stage: Stage, signals: int, seed: int, place: Path) -> Result:
     rng, tally = random.Random(seed), Tally()
-    with Nursery() as nursery:
-        reference = Reference(nursery.start, place / "whole", iterations)
-        chain = Chain(place / "run", reference, nursery.start, tally)
-        while tally.tried < signals:
-            _signal(chain, rng, tally, fresh=tally.tried % 10 == 9)
-            if chain.is_complete() or tally.tried == signals:
-                if not chain.is_complete():
-                    chain.finish()
-                chain = Chain(place / "run", reference, nursery.start, tally)
+    chain = stage.chain(place / "run", tally)
+    while tally.tried < signals:
+        _signal(chain, rng, tally, fresh=tally.tried % 10 == 9)
+        if chain.is_complete() or tally.tried == signals:
+            if not chain.is_complete():
+                chain.finish()
+            chain = stage.chain(place / "run", tally)
     return tally.result()
 
 
@@ -83,5 +75,5 @@ def _count(chain: Chain, said: str, tally: Tally, what: str) -> None:
         tally.count("came before training began")
 
 
-def test_a_signal_saves_and_a_second_one_leaves_a_safe_state(tmp_path: Path) -> None:
-    assert_held(experiment(3, 2, tmp_path, iterations=60), 3)
+def test_a_signal_saves_and_a_second_one_leaves_a_safe_state(stage: Stage, tmp_path: Path) -> None:
+    assert_held(_stop_again_and_again(stage, 3, 2, tmp_path), 3)

@@ -4,44 +4,37 @@ from __future__ import annotations
 
 import random
 import shutil
+import signal
 import time
 from pathlib import Path
 
-from faults.chain import (
-    Chain,
-    Nursery,
-    Reference,
-    children,
-    orphans,
-    send,
-    signal,
-    train_arguments,
-)
-from faults.nursery import Process
+from faults.chain import Chain, Stage, children, orphans, send, train_arguments
+from faults.nursery import Nursery, Process
 from faults.result import Result, Tally, assert_held
 
 AT_A_TIME = 3
 
 
-def experiment(races: int, seed: int, place: Path, iterations: int = 300) -> Result:
+def experiment(races: int, seed: int, place: Path) -> Result:
     """Lets three processes resume one run at the same moment, or start one in the same folder.
 
     The winner is then killed, so that the next race begins with the lock of a dead process.
     `worst`: seconds until the losers have ended.
     """
+    with Stage(place) as stage:
+        return _race_again_and_again(stage, races, seed, place)
+
+
+def _race_again_and_again(stage: Stage, races: int, seed: int, place: Path) -> Result:
     rng, tally = random.Random(seed), Tally()
-    with Nursery() as nursery:
-        reference = Reference(nursery.start, place / "whole", iterations)
-        chain = Chain(place / "run", reference, nursery.start, tally)
-        while tally.tried < races:
-            if rng.random() < 0.33 or not (chain.run / "config.json").exists():
-                shutil.rmtree(chain.run, ignore_errors=True)
-                chain = Chain(place / "run", reference, nursery.start, tally)
-                arguments = train_arguments(chain.run, steps=reference.steps)
-            else:
-                arguments = ["resume", str(chain.run)]
-            _race(nursery, arguments, chain, tally, rng.uniform(0.0, 0.8))
-        chain.finish()
+    chain = stage.chain(place / "run", tally)
+    while tally.tried < races:
+        arguments = ["resume", str(chain.run)]
+        if rng.random() < 0.33 or not (chain.run / "config.json").exists():
+            chain = stage.chain(place / "run", tally)  # in an empty folder
+            arguments = train_arguments(chain.run, steps=stage.reference.steps)
+        _race(stage.nursery, arguments, chain, tally, rng.uniform(0.0, 0.8))
+    shutil.rmtree(chain.run)
     return tally.result()
 
 
@@ -86,5 +79,5 @@ def _check_told(loser: Process, winner: Process, what: str, tally: Tally) -> Non
         tally.miss(f"{what}: a loser said {said[-300:]!r}, the winner was {winner.pid}")
 
 
-def test_one_gets_the_run_and_the_others_are_told(tmp_path: Path) -> None:
-    assert_held(experiment(3, 6, tmp_path, iterations=60), 3)
+def test_one_gets_the_run_and_the_others_are_told(stage: Stage, tmp_path: Path) -> None:
+    assert_held(_race_again_and_again(stage, 3, 6, tmp_path), 3)
