@@ -130,6 +130,8 @@ def main(arguments: list[str] | None = None) -> None:
         _fail("interrupted", 130)
     except BrokenPipeError:
         sys.exit(1)
+    except OSError as error:
+        _fail(f"cannot read or write {error.filename or 'a file'}: {error.strerror or error}", 1)
     except Exception as error:
         traceback.print_exc()
         _fail(f"unexpected {type(error).__name__}: {error}", 1)

@@ -44,7 +44,8 @@ def experiment(least: int, seed: int, place: Path) -> Result:
 def _judge(name: str, line: dict, tally: Tally) -> None:
     tally.tried += 1
     tally.took(line["seconds"])
-    tally.notes["most memory, MiB"] = max(tally.notes.get("most memory, MiB", 0), line["MiB"])
+    name_of_most = "most MiB beyond what the process had"
+    tally.notes[name_of_most] = max(tally.notes.get(name_of_most, 0), line["MiB"])
     if line["error"] is None:
         tally.miss(f"{name}: was loaded")
     elif not line["refused"]:
@@ -57,6 +58,12 @@ def _judge(name: str, line: dict, tally: Tally) -> None:
 
 def _memory() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def _resident(field: str) -> int:
+    """KiB of resident memory: now, or the most there ever was."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split(f"{field}:")[1].split()[0])
 
 
 def _load(run: Path) -> None:
@@ -96,7 +103,7 @@ def main() -> None:
             events.append(f"{event} {str(arguments)[:80]}")
 
     sys.addaudithook(audit)
-    base = _memory()
+    base, before = _memory(), _resident("VmRSS")
     resource.setrlimit(resource.RLIMIT_AS, (base + MEMORY, resource.RLIM_INFINITY))
     for name in [*map(str, range(number)), "good"]:
         run, error, refused = (place / name).resolve(), None, False
@@ -110,7 +117,7 @@ def main() -> None:
         except BaseException as found:
             error = repr(found)
         inside.clear()
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+        peak = (_resident("VmHWM") - before) // 1024
         print(json.dumps({"error": error, "refused": refused, "events": list(events),
                           "seconds": time.process_time() - clock,
                           "waited": time.monotonic() - start, "MiB": peak}))  # fmt: skip

@@ -9,10 +9,14 @@ import shutil
 import time
 from pathlib import Path
 
+import pytest
+
 from faults.canned import Ended, Trap, go, played_back, record, until
+from faults.disk import Op, tree_of, watched
+from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
 from helpers import Recorder
-from sauna import checkpoint
+from sauna import checkpoint, cli
 from sauna.errors import BadInput, SaunaError
 
 ERRORS = (errno.ENOSPC, errno.EROFS, errno.EIO)
@@ -78,3 +82,21 @@ def _check_kept(run: Path, trap: Trap, what: str, tally: Tally) -> None:
 
 def test_every_failing_write_is_told_and_loses_nothing(tmp_path: Path) -> None:
     assert_held(experiment(30, 3, tmp_path), 30)
+
+
+def test_an_evaluation_that_cannot_be_written_is_one_line(tmp_path: Path, capsys) -> None:
+    """And the run that it evaluates is as it was."""
+    number = errno.EROFS
+    run = tmp_path / "run"
+    shutil.copytree(next(GOLDEN.iterdir()), run)
+    before = tree_of(run)
+
+    def fail(op: Op) -> None:
+        raise OSError(number, os.strerror(number), str(run / op.path))
+
+    with watched(run, fail), pytest.raises(SystemExit) as end:
+        cli.main(["eval", str(run), "--episodes", "1"])
+    errors = capsys.readouterr().err
+    assert end.value.code == 1 and errors.count("\n") == 1
+    assert errors.startswith("sauna: cannot read or write ") and os.strerror(number) in errors
+    assert tree_of(run) == before
