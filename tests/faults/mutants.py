@@ -4,7 +4,8 @@
     python tests/faults/mutants.py --only NAME    those whose name contains NAME; nothing is stored
 
 Each mistake is made in a copy of the sources, and pytest runs on it: first the tests of that part,
-then all that are about numbers, then whole small trainings. The processes are forked from one that has imported JAX.
+then all that are about numbers, then whole small trainings. The processes are forked from one that
+has imported JAX.
 """
 
 from __future__ import annotations
