@@ -1,6 +1,9 @@
 # make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
 # make test   install into .venv, run the tests
 # make test-slow  the tests that take minutes; installs what they need besides (Ray)
+# make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
+# make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
+# make soak      two hours of a long run: do memory and open files stay flat?
 # make lint   style, format and types
 # make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
 
@@ -8,7 +11,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: setup demo test test-slow lint results clean
+.PHONY: setup demo test test-slow campaign mutants soak lint results clean
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
@@ -36,6 +39,15 @@ test: .venv/.dev
 
 test-slow: .venv/.cluster
 	$(BIN)/python -m pytest -m slow
+
+campaign: .venv/.dev
+	$(BIN)/python tests/faults/campaign.py
+
+mutants: .venv/.dev
+	$(BIN)/python tests/faults/mutants.py
+
+soak: .venv/.dev
+	$(BIN)/python tests/faults/soak.py
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

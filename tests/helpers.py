@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +13,9 @@ import numpy as np
 from sauna.config import Config
 from sauna.core.population import Program, make_program
 from sauna.member_state import flat_params
+from sauna.placement import look_at, placed
 from sauna.presets import members, resolve
-from sauna.run import look_at, placed, settle
+from sauna.run import settle
 from sauna.training import Job, train_members
 
 SMALL = {
@@ -23,6 +26,15 @@ SMALL = {
     "steps": 128,
     "seeds": 1,
 }
+
+
+TESTS = str(Path(__file__).parent)
+
+
+def environment() -> dict[str, str]:
+    """Of a process that finds the environments of `worlds.py`."""
+    path = [TESTS, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
 class Recorder:

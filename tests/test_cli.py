@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,20 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers import SMALL
+from helpers import SMALL, environment
 from sauna import cli, rundir
 from sauna.config import FIELDS, flag, parse, to_json
 from sauna.errors import BadInput
 from sauna.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
 
 WORLD = "worlds:Scripted"
-TESTS = str(Path(__file__).parent)
 
 
 def sauna(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "sauna", *arguments],
-        capture_output=True, text=True, cwd=cwd, env={**os.environ, "PYTHONPATH": TESTS},
+        capture_output=True, text=True, cwd=cwd, env=environment(),
     )  # fmt: skip
 
 

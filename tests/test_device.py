@@ -244,10 +244,10 @@ def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
 def test_bad_input_is_refused(
     settings: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sauna import run
+    from sauna import placement, run
     from sauna.metrics.display import PlainDisplay
 
-    monkeypatch.setattr(run, "has_gpu", lambda: False)
+    monkeypatch.setattr(placement, "has_gpu", lambda: False)
     with pytest.raises(BadInput, match=message):
         run.start({**SMALL, **settings}, PlainDisplay())
 

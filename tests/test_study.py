@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from helpers import SMALL
+from helpers import SMALL, environment
 from sauna import rundir
 from sauna.api import compare
 from sauna.errors import BadInput
@@ -24,7 +23,7 @@ from sauna.study.process import UnitProcess
 from sauna.study.spec import built_in, check, load_spec, read_spec
 from sauna.study.summary import summarize
 from sauna.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
-from test_cli import TESTS, sauna, small_flags
+from test_cli import sauna, small_flags
 
 TWO = {"tasks": ["A-v0"], "seeds": 6, "arms": [{"label": "ppo"}, {"label": "sauna"}]}
 QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
@@ -224,9 +223,8 @@ def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp
     """SIGKILL leaves no orphan behind; SIGTERM saves and exits 143."""
     command = [sys.executable, "-m", "sauna", "compare", "worlds:Scripted", "--out", str(tmp_path),
                *FLAGS]  # fmt: skip
-    environment = {**os.environ, "PYTHONPATH": TESTS}
     for number, pause in ((signal.SIGKILL, 6.0), (signal.SIGTERM, 9.0)):
-        started = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        started = subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True)
         time.sleep(pause)
         started.send_signal(number)
         assert started.wait(60) in (-9, 143, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
 import time
 from typing import Any
 
@@ -186,11 +187,86 @@ class NotANumber(Scripted):
         return seen
 
 
+class Poisoned(Scripted):
+    """One number that is none, in one place of one episode.
+
+    Args:
+      field: `first`, `observation`, `final` (of an episode's end) or `reward`.
+      value: `nan`, `inf` or `-inf`.
+      component: of the observation.
+      episode: counted by this environment's resets, from 1.
+      step: of that episode, from 1; not read where `field` says when.
+    """
+
+    episodes = 0
+
+    def __init__(
+        self, field: str, value: str, component: int = 1, episode: int = 3, step: int = 1
+    ) -> None:
+        self.field, self.value, self.component = field, float(value), component
+        self.bad = (episode, step)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.episodes += 1
+        return super().reset(seed=seed)
+
+    def observe(self) -> np.ndarray:
+        seen = super().observe()
+        when = {"first": self.t == 0, "observation": self.t == self.bad[1],
+                "final": self.t >= self.end}  # fmt: skip
+        if self.episodes == self.bad[0] and when.get(self.field):
+            seen[self.component] = self.value
+        return seen
+
+    def reward(self, action: Any) -> float:
+        reward = super().reward(action)
+        bad = self.field == "reward" and (self.episodes, self.t + 1) == self.bad
+        return self.value if bad else reward
+
+
 class Dying(Scripted):
     """Its process ends in the middle of an episode."""
 
     def reward(self, action: Any) -> float:
         os._exit(7)
+
+
+class Failing(Scripted):
+    """Fails in one of many ways at a reset or a step of one episode.
+
+    Args:
+      what: `exit`, `abort`, `kill`, `raise`, `hang`, or `stop` (the process stops itself).
+      where: `reset` or `step`.
+      episode: counted by this environment's resets, from 1.
+      seed: only an environment whose episode was reset with this seed does, or any.
+    """
+
+    episodes = 0
+
+    def __init__(self, what: str, where: str, episode: int, seed: int | None = None) -> None:
+        self.what, self.bad, self.only = what, (where, episode), seed
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.episodes += 1
+        self.fails = self.only in (None, seed)
+        self.fail("reset")
+        return super().reset(seed=seed)
+
+    def reward(self, action: Any) -> float:
+        self.fail("step")
+        return super().reward(action)
+
+    def fail(self, where: str) -> None:
+        if (where, self.episodes) != self.bad or not self.fails:
+            return
+        if self.what == "raise":
+            raise ValueError("the motor is on fire")
+        if self.what == "exit":
+            os._exit(7)
+        if self.what == "hang":
+            time.sleep(3600)
+        number = {"abort": signal.SIGABRT, "kill": signal.SIGKILL, "stop": signal.SIGSTOP}
+        os.kill(os.getpid(), number[self.what])
 
 
 class Hanging(Scripted):

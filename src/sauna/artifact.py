@@ -33,7 +33,10 @@ def load_artifact(run: Path, warn: Callable[[str], None] = print) -> Artifact:
     loaded = checkpoint.load_newest(run / "checkpoints", warn)
     if loaded is None:
         raise BadInput(f"{run} has no checkpoint yet")
-    spaces = read_spaces(loaded.manifest["spaces"])
+    try:
+        spaces = read_spaces(loaded.manifest["spaces"])
+    except (TypeError, ValueError, LookupError) as error:
+        raise checkpoint.BadCheckpoint(f"{loaded.path}: its spaces cannot be read") from error
     config = stored_config(loaded.manifest["config"])
     return Artifact(config, spaces, loaded.manifest["members"], loaded)
 

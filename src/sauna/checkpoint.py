@@ -3,7 +3,8 @@
     checkpoints/00000488/{state.safetensors, manifest.json}
 
 The folder's number is the iteration that the state is at the start of. A checkpoint is written
-beside its place, flushed to disk, and renamed; older ones are pruned only after that.
+beside its place, flushed to disk, and renamed; older ones are pruned only after that. Reading
+trusts nothing: see `untrusted.py`.
 """
 
 from __future__ import annotations
@@ -12,19 +13,39 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from sauna.errors import SaunaError
+from sauna.untrusted import JSON_BYTES, Untrusted, check_tensors, parse_object, read_file
 
 FORMAT = 1
+LARGEST = 2**34  # bytes of a state that are read at most
+# How a manifest of an older format becomes one of the next, by the older one's number.
+MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
+# What a manifest holds; the last five are a run's.
+TYPES = {"format": int, "iteration": int, "sha256": str, "bytes": int, "config": dict,
+         "given": dict, "spaces": list, "members": list, "logs": dict}  # fmt: skip
+
+
+Check = Callable[[dict[str, Any]], None]
 
 
 class BadCheckpoint(SaunaError):
     """A checkpoint that cannot be trusted; the message names it and says why."""
+
+
+class NewerFormat(SaunaError):
+    """A checkpoint of a version that is newer than this one: an older one must not replace it."""
+
+
+class NotFinite(SaunaError):
+    """A state that must not be saved, because something in it is NaN or infinite."""
 
 
 class Checkpoint(NamedTuple):
@@ -36,7 +57,17 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(
     folder: Path, iteration: int, arrays: dict[str, np.ndarray], manifest: dict[str, Any], keep: int
 ) -> Path:
-    """Writes `folder/ITERATION` atomically, then removes all but the newest `keep`."""
+    """Writes `folder/ITERATION` atomically, then removes all but the newest `keep`.
+
+    Raises:
+      NotFinite: an array is not finite; nothing was written.
+    """
+    for name, array in arrays.items():
+        # What an environment of the device keeps in its state is its own affair.
+        if "/collect/envs/" in name:
+            continue
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise NotFinite(f"{name} is not finite: the last finite checkpoint is kept")
     final = folder / f"{iteration:08d}"
     blob = save(dict(sorted(arrays.items())))
     manifest = {
@@ -48,7 +79,7 @@ def save_checkpoint(
     }
     manifest["manifest_sha256"] = _digest(manifest)
     if final.exists():
-        if _holds(final, manifest["sha256"]):  # saved before the run was stopped here
+        if _holds(final, manifest):  # saved before the run was stopped here
             return final
         final.rename(_free_name(final))
     for left in folder.glob(".writing-*"):
@@ -72,16 +103,18 @@ def _digest(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def _holds(path: Path, sha256: str) -> bool:
-    """Whether a checkpoint is good and has these arrays."""
+def _holds(path: Path, manifest: dict[str, Any]) -> bool:
+    """Whether a checkpoint is good, has these arrays, and counts on these logs."""
     try:
-        return bool(load_checkpoint(path).manifest["sha256"] == sha256)
+        found = load_checkpoint(path).manifest
     except BadCheckpoint:
         return False
+    same_arrays = found["sha256"] == manifest["sha256"]
+    return bool(same_arrays and found["logs"] == manifest.get("logs", {}))
 
 
 def _free_name(path: Path) -> Path:
-    """Where a bad checkpoint is kept: `NUMBER.bad`, `NUMBER.bad2`, ..."""
+    """Where a checkpoint that cannot be used is kept: `NUMBER.bad`, `NUMBER.bad2`, ..."""
     names = (path.with_name(f"{path.name}.bad{i or ''}") for i in [0, *range(2, 1000)])
     return next(name for name in names if not name.exists())
 
@@ -103,33 +136,77 @@ def sync_folder(folder: Path) -> None:
 
 def numbered(folder: Path) -> list[Path]:
     """The finished checkpoints of a run, oldest first."""
-    return sorted(path for path in folder.glob("[0-9]" * 8) if path.is_dir())
+    found = folder.glob("[0-9]" * 8)
+    return sorted(path for path in found if path.is_dir() and not path.is_symlink())
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(
+    path: Path, check: Callable[[dict[str, Any]], None] | None = None
+) -> Checkpoint:
     """A checkpoint whose bytes are those that were written.
 
+    `check(manifest)` may refuse it before its tensors are read.
+
     Raises:
-      BadCheckpoint: a file is missing, cut short or changed, or of another format.
+      BadCheckpoint: a file is missing, cut short or changed.
+      NewerFormat: only a newer version can read it.
     """
     try:
-        manifest = json.loads((path / "manifest.json").read_bytes())
-        blob = (path / "state.safetensors").read_bytes()
-    except (OSError, ValueError) as error:
-        raise BadCheckpoint(f"{path}: cannot be read: {error}") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise BadCheckpoint(f"{path}: not a checkpoint of format {FORMAT}")
-    if _digest(manifest) != manifest.get("manifest_sha256"):
-        raise BadCheckpoint(f"{path}: manifest.json is not what was written (SHA-256 differs)")
-    if path.name != f"{manifest['iteration']:08d}":
-        raise BadCheckpoint(f"{path}: holds iteration {manifest['iteration']}")
-    if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
-        raise BadCheckpoint(f"{path}: state.safetensors is not what was written (SHA-256 differs)")
-    return Checkpoint(path, manifest, load(blob))
+        manifest = _manifest(path)
+        if check is not None:
+            check(manifest)
+        blob = read_file(path / "state.safetensors", min(manifest["bytes"], LARGEST))
+        if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
+            raise Untrusted("state.safetensors is not what was written (SHA-256 differs)")
+        check_tensors(blob)
+        return Checkpoint(path, manifest, load(blob))
+    except (Untrusted, SafetensorError) as error:
+        raise BadCheckpoint(f"{path}: {error}") from error
 
 
-def load_newest(folder: Path, warn: Any) -> Checkpoint | None:
-    """The newest checkpoint that can be trusted; `warn(text)` is called for each bad newer one.
+def _manifest(path: Path) -> dict[str, Any]:
+    """The manifest, brought to today's format.
+
+    Raises:
+      Untrusted: it is not what was written, or of a format that never was.
+      NewerFormat: only a newer version can read it.
+    """
+    stored = parse_object(read_file(path / "manifest.json", JSON_BYTES))
+    number = stored.get("format")
+    if _digest(stored) != stored.get("manifest_sha256"):
+        raise Untrusted("manifest.json is not what was written (SHA-256 differs)")
+    if type(number) is int and number > FORMAT:
+        raise NewerFormat(f"{path} is of format {number}; this version reads up to {FORMAT}")
+    if type(number) is not int or (number != FORMAT and number not in MIGRATIONS):
+        raise Untrusted(f"not a checkpoint of format {FORMAT}")
+    while number < FORMAT:
+        stored, number = MIGRATIONS[number](stored), number + 1
+    _check_types(stored)
+    if path.name != f"{stored['iteration']:08d}":
+        raise Untrusted(f"holds iteration {stored['iteration']}")
+    return stored
+
+
+def _check_types(manifest: dict[str, Any]) -> None:
+    """Each entry's type; what a run adds may be missing, and is then empty."""
+    for name, kind in TYPES.items():
+        if kind in (dict, list):
+            manifest.setdefault(name, kind())
+        if type(manifest.get(name)) is not kind:
+            raise Untrusted(f"manifest.json: {name} is missing or of another type")
+    for name, size in manifest["logs"].items():
+        if Path(name).name != name or type(size) is not int or size < 0:
+            raise Untrusted("manifest.json: logs are not names of files and their sizes")
+
+
+def load_newest(
+    folder: Path,
+    warn: Callable[[str], None],
+    check: Check | None = None,
+) -> Checkpoint | None:
+    """The newest checkpoint that can be used; `warn(text)` is called for each newer one.
+
+    `check(manifest)` raises BadCheckpoint for one that cannot be used, or what else it wants.
 
     Raises:
       BadCheckpoint: there are checkpoints, but none is good.
@@ -137,7 +214,7 @@ def load_newest(folder: Path, warn: Any) -> Checkpoint | None:
     found = numbered(folder)
     for path in reversed(found):
         try:
-            return load_checkpoint(path)
+            return load_checkpoint(path, check)
         except BadCheckpoint as error:
             warn(f"warning: {error}; using an older checkpoint")
             last = error

@@ -132,6 +132,8 @@ def main(arguments: list[str] | None = None) -> None:
         _fail("interrupted", 130)
     except BrokenPipeError:
         sys.exit(1)
+    except OSError as error:
+        _fail(f"cannot read or write {error.filename or 'a file'}: {error.strerror or error}", 1)
     except Exception as error:
         traceback.print_exc()
         _fail(f"unexpected {type(error).__name__}: {error}", 1)
@@ -278,8 +280,9 @@ def _bench(values: dict[str, Any]) -> None:
         del given[name]
     from sauna.bench.command import bench, bench_scale, report
     from sauna.bench.device import bench_on_device, report_on_device, scale_on_device
+    from sauna.placement import placed
     from sauna.presets import resolve
-    from sauna.run import placed, plain
+    from sauna.run import plain
 
     native = placed(resolve(plain(given))).backend == "device"
     if native and values["scale"]:

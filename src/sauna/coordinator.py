@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sauna import checkpoint, rundir
+from sauna import checkpoint, rundir, watch
 from sauna.config import Config, local_parts, to_json
 from sauna.errors import Interrupted, SaunaError
 from sauna.metrics.curve import draw_curve
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
+from sauna.watch import Watch
 from sauna.wire import Message, Worker, receive, start_thread, start_worker
 from sauna.worker import serve, write_job
 
@@ -63,6 +64,7 @@ class Coordinator:
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
         self._workers = [self._start(part, loaded, replay) for part in self._parts]
+        self._watch = Watch(self._workers)
 
     def _start(
         self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
@@ -97,6 +99,7 @@ class Coordinator:
         return self
 
     def __exit__(self, *error: Any) -> None:
+        self._watch.close()
         for worker in self._workers:
             worker.stop(0.0 if error[0] else 5.0)
         self._tensorboard.close()
@@ -162,18 +165,29 @@ class Coordinator:
             for number, worker in enumerate(self._workers)
             if self._ended[number] is None
         }
-        for inbox in wait(list(inboxes), timeout=0.1):
+        with self._watch.listening():
+            ready = wait(list(inboxes), timeout=0.1)
+        for inbox in ready:
             number = inboxes[inbox]  # type: ignore[index]
-            try:
-                message = receive(inbox)  # type: ignore[arg-type]
-            except EOFError:
-                code = self._workers[number].process.wait()
-                pid = self._workers[number].process.pid
-                raise SaunaError(
-                    f"training process {number} ({pid}) ended with exit code {code}"
-                ) from None
-            self._handle(number, message)
+            self._handle(number, self._receive(number))
         self._display.refresh()
+
+    def _receive(self, number: int) -> Message:
+        worker = self._workers[number]
+        try:
+            with self._watch.listening():
+                message = receive(worker.inbox)
+        except (EOFError, ConnectionResetError):
+            code = worker.process.wait()
+            how = f"ended with exit code {code}"
+            if number in self._watch.hung:
+                how = f"gave no sign of life for {watch.SILENCE:g} s and was killed"
+            raise SaunaError(
+                f"training process {number} ({worker.process.pid}) {how}; the last good "
+                f"checkpoint is kept, continue with: sauna resume {self._run.path}"
+            ) from None
+        self._watch.heard(number)
+        return message
 
     def _handle(self, number: int, message: Message) -> None:
         header = message.header

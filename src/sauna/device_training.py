@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from sauna.collect.collected import Collected, Episode
 from sauna.config import Config
@@ -36,7 +35,7 @@ from sauna.envs.jax_env import flat
 from sauna.envs.jax_native import make_jax_env
 from sauna.errors import BadInput
 from sauna.machines import join, read_place, share, tell
-from sauna.member_state import Counters, flat_params, named_params, under
+from sauna.member_state import Counters, fitting, flat_params, named_params, under, unpack_adam
 from sauna.metrics.rows import metrics_row
 from sauna.presets import Member
 from sauna.training import Job, Reporter, check_finite, goes_on
@@ -224,15 +223,18 @@ def _is_key(leaf: Any) -> bool:
 
 
 def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """A tree like `example` with the arrays of `named_leaves`."""
-    names = list(named_leaves(example))
+    """A tree like `example` with the arrays of `named_leaves`.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
     leaves, structure = jax.tree_util.tree_flatten(example)
-    found = [
-        jax.random.wrap_key_data(jnp.asarray(arrays[name]), impl=jax.random.key_impl(leaf))
-        if _is_key(leaf)
-        else jnp.asarray(arrays[name])
-        for name, leaf in zip(names, leaves, strict=True)
-    ]
+    found = []
+    for leaf, (name, place) in zip(leaves, named_leaves(example).items(), strict=True):
+        array = jnp.asarray(fitting(arrays, name, place))
+        if _is_key(leaf):
+            array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))
+        found.append(array)
     return jax.tree_util.tree_unflatten(structure, found)
 
 
@@ -242,11 +244,7 @@ def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray])
     for member, example in zip(job.members, population.states(), strict=True):
         own = under(member.name + "/", arrays)
         counted = Counters.from_arrays(own)
-        adam = optax.ScaleByAdamState(
-            jnp.asarray(own["adam/count"]),
-            jnp.asarray(own["adam/mean"]),
-            jnp.asarray(own["adam/variance"]),
-        )
+        adam = unpack_adam(own, example.learner)
         params = flat_params(population.policy, example.learner.params, under("params/", own))
         states.append(
             MemberState(

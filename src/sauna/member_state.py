@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
+from sauna.checkpoint import BadCheckpoint
 from sauna.collect.collected import Collected
 from sauna.collect.host import HostCollector
 from sauna.core.normalize import Moments
@@ -79,8 +81,25 @@ def flat_params(policy: Policy, example: jax.Array, named: Mapping[str, np.ndarr
     """The inverse of `named_params`; `example` is any parameter vector of the policy."""
     tree = policy.unravel(example)
     structure = jax.tree_util.tree_structure(tree)
-    leaves = [jnp.asarray(named[name]) for name in named_params(policy, example)]
+    leaves = [
+        jnp.asarray(fitting(named, name, leaf))
+        for name, leaf in named_params(policy, example).items()
+    ]
     return ravel_pytree(jax.tree_util.tree_unflatten(structure, leaves))[0]
+
+
+def fitting(stored: Mapping[str, np.ndarray], name: str, place: Any) -> np.ndarray:
+    """A stored array, if it is there and fits where it belongs.
+
+    Raises:
+      BadCheckpoint: it is missing, or of another shape or type.
+    """
+    array = stored.get(name)
+    if array is None or (array.shape, array.dtype) != (place.shape, place.dtype):
+        found = "missing" if array is None else f"{array.dtype}{list(array.shape)}"
+        expected = f"{place.dtype}{list(place.shape)}"
+        raise BadCheckpoint(f"checkpoint: {name} is {found}; this network and run need {expected}")
+    return array
 
 
 def pack_member(
@@ -107,6 +126,19 @@ def pack_member(
     return {f"{name}/{key}": np.array(value) for key, value in arrays.items()}
 
 
+def unpack_adam(own: Mapping[str, np.ndarray], example: TrainState) -> optax.ScaleByAdamState:
+    """The optimiser's state.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    like = example.optimizer
+    names = {"adam/count": like.count, "adam/mean": like.mu, "adam/variance": like.nu}
+    return optax.ScaleByAdamState(
+        *(jnp.asarray(fitting(own, name, place)) for name, place in names.items())
+    )
+
+
 def unpack_member(
     name: str,
     p: int,
@@ -125,18 +157,14 @@ def unpack_member(
       NotRestored: a replayed environment shows another observation than the stored one.
     """
     own = under(name + "/", arrays)
-    adam = optax.ScaleByAdamState(
-        jnp.asarray(own["adam/count"]),
-        jnp.asarray(own["adam/mean"]),
-        jnp.asarray(own["adam/variance"]),
-    )
+    adam = unpack_adam(own, example)
     state = TrainState(flat_params(policy, example.params, under("params/", own)), adam)
     counters = Counters.from_arrays(own)
     for key, place in moments_of(collector, p).items():
-        place[...] = own[key]
+        place[...] = fitting(own, key, place)
     if replay:
         for key, place in collected_of(collector, p).items():
-            place[...] = own[key]
+            place[...] = fitting(own, key, place)
     collect = collector.state
     number = len(collect.observation[p])
     for n in range(number):

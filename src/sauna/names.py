@@ -17,6 +17,8 @@ def import_name(key: str, path: str) -> Any:
       BadInput: the module or the name does not exist, or importing it failed.
     """
     module_name, _, attribute = path.partition(":")
+    if module_name.partition(".")[0] in sys.stdlib_module_names:
+        raise BadInput(f"{key}: {module_name!r} is a part of Python, which no run may call")
     if "" not in sys.path and str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:

@@ -163,14 +163,15 @@ def _check_same_program(arm: str, config: Config, shared: Config) -> None:
 
 
 def stored_config(stored: Mapping[str, Any]) -> Config:
-    """The config that `config.to_json` wrote, perhaps by an older version.
+    """The config that `config.to_json` wrote, perhaps before some fields existed.
 
-    A field that did not exist then has the default: what was done before there was a choice.
+    A field that is missing has its default: whoever adds one sees to it that its default is what
+    was done before.
 
     Raises:
       BadInput: a key is unknown, or a value cannot be read.
     """
-    return Config(**parse_all({**to_json(Config()), **stored}))
+    return Config(**parse_all(stored))
 
 
 def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,22 +7,22 @@ once, and the training itself happens in the workers that `coordinator.py` start
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from sauna import checkpoint, rundir
 from sauna.config import ON_DEVICE, Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
-from sauna.envs.native import is_native
-from sauna.envs.probe import Probe, probe, probe_on_device
-from sauna.errors import BadInput, one_line
+from sauna.envs.probe import Probe
+from sauna.errors import BadInput, SaunaError, one_line
 from sauna.machines import Follower, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
+from sauna.placement import look_at, placed
 from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_config
 from sauna.spaces import Spaces
 from sauna.worker import configure_jax
@@ -95,9 +95,15 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
         "git": rundir.git_revision(),
         "machine": rundir.machine(),
     }
-    rundir.create(path)
-    run = Run(path, given, config, found, drop_rates)
-    rundir.write_json(path / "config.json", stored)
+    with _disk_errors(path):
+        rundir.create(path)
+        run = Run(path, given, config, found, drop_rates)
+        try:
+            rundir.create(path)  # again, now that it is ours: another may have been faster
+            rundir.write_json(path / "config.json", stored)
+        except BaseException:
+            run.held.close()
+            raise
     if found.differs:
         display.say(
             f"warning: {config.env} does not repeat itself ({found.differs}): this run can be "
@@ -140,47 +146,18 @@ def follow(given: Mapping[str, Any], display: Display) -> None:
     train_members(job, Follower(display.say))
 
 
-def placed(config: Config) -> Config:
-    """Resolves where the environments run, and on what.
-
-    Raises:
-      BadInput: a setting that is not read there.
-    """
-    if config.backend == "auto" and is_native(config.env, json.loads(config.env_kwargs)):
-        config = dataclasses.replace(config, backend="device")
-    if config.backend != "device":
-        return config
-    if config.env_processes:
-        raise BadInput("env_processes: not read with backend device")
-    if read_place(config.distributed).machines > 1 and config.devices:
-        raise BadInput("devices: not read with distributed, where every device takes part")
-    most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
-    if most >= 2**31:
-        raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")
-    device = config.device
-    if device == "gpu" and not has_gpu():
-        raise BadInput("device: no NVIDIA GPU here that JAX can use; "
-                       "`pip install 'sauna-rl[gpu]'` where there is one")  # fmt: skip
-    if device == "auto":
-        device = "gpu" if has_gpu() else "cpu"
-    return dataclasses.replace(config, device=device)
-
-
-def has_gpu() -> bool:
-    """Whether there is an NVIDIA GPU and a JAX that can use it; found without importing JAX."""
-    plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
-    return Path("/proc/driver/nvidia/version").exists() and any(
-        importlib.util.find_spec(name) is not None for name in plugins
-    )
-
-
-def look_at(config: Config) -> Probe:
-    """What has to be known of the environment before a run starts."""
-    kwargs = json.loads(config.env_kwargs)
-    if config.backend != "device":
-        return probe(config.env, kwargs)
-    configure_jax()
-    return probe_on_device(config.env, kwargs)
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """What the system says of a file becomes one line, with what to do next."""
+    try:
+        yield
+    except BrokenPipeError:  # of our own output: nobody reads it any more
+        raise
+    except OSError as error:
+        again = "; the last good checkpoint is kept, continue with: sauna resume "
+        hint = f"{again}{path}" if (path / "config.json").exists() else ""
+        place = error.filename or path
+        raise SaunaError(f"cannot read or write {place}: {error.strerror}{hint}") from error
 
 
 def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
@@ -272,7 +249,8 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
         raise BadInput(f"{config.env} has other spaces than when the run started: "
                        f"{found.spaces} instead of {stored['spaces']}")  # fmt: skip
-    return Run(path, dict(given), config, found, stored["drop_rates"])
+    with _disk_errors(path):
+        return Run(path, dict(given), config, found, stored["drop_rates"])
 
 
 def _drop_rates(everyone: list[Member]) -> list[list[float]]:
@@ -308,33 +286,62 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
       SaunaError: something failed; the last good checkpoint is on disk.
     """
     try:
-        loaded = None
-        if resume:
-            if rundir.is_complete(run.path):
-                display.say(f"{run.path} is complete; nothing to do")
-                return
-            loaded = checkpoint.load_newest(run.path / "checkpoints", display.say)
-            _check_same(run, loaded)
-            rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
-        with Coordinator(run, display, loaded, inexact) as coordinator:
-            coordinator.run()
+        with _disk_errors(run.path):
+            _train(run, display, resume, inexact)
     finally:
         run.held.close()
 
 
-def _check_same(run: Run, loaded: checkpoint.Checkpoint | None) -> None:
+def _train(run: Run, display: Display, resume: bool, inexact: bool) -> None:
+    loaded = None
+    if resume:
+        if rundir.is_complete(run.path):
+            display.say(f"{run.path} is complete; nothing to do")
+            return
+        loaded = _load(run, display)
+        rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+    with Coordinator(run, display, loaded, inexact) as coordinator:
+        coordinator.run()
+
+
+def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
+    """The newest checkpoint that is good, of this run, and whose rows are all there.
+
+    Raises:
+      BadInput: a checkpoint is of another run or environment; each field that differs is named.
+      BadCheckpoint: there are checkpoints, but none can be used.
+    """
+    own = run.manifest()
+
+    def check(manifest: dict[str, Any]) -> None:
+        _check_same(run.path, own, manifest)
+        rundir.check_logs(run.path, manifest["logs"])
+
+    loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
+    before = loaded.manifest.get("versions", {}) if loaded else {}
+    changed = [f"{name} {before[name]} -> {own['versions'].get(name)}" for name in before
+               if before[name] != own["versions"].get(name)]  # fmt: skip
+    if changed:
+        display.say(f"warning: other versions than when the checkpoint was saved "
+                    f"({', '.join(changed)}): the rest may differ in its last bits")  # fmt: skip
+    return loaded
+
+
+def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> None:
     """Refuses a checkpoint that another config or environment wrote.
 
     Raises:
-      BadInput: with the first field that differs.
+      BadInput: with every field that differs.
     """
-    if loaded is None:
-        return
-    own = run.manifest()
-    for name, value in own["config"].items():
-        stored = to_json(stored_config(loaded.manifest["config"]))[name]
-        if name not in (*RESUMABLE, "out") and stored != value:
-            raise BadInput(f"{loaded.path} is of another run: {name} is {stored!r}, not {value!r}")
+    stored = {**to_json(Config()), **manifest["config"]}  # a field added since had its default
+    differing = [
+        f"{name} is {stored[name]!r}, not {value!r}"
+        for name, value in own["config"].items()
+        if name not in (*RESUMABLE, "out") and stored[name] != value
+    ]
     for name in ("spaces", "members"):
-        if loaded.manifest[name] != json.loads(json.dumps(own[name])):
-            raise BadInput(f"{loaded.path} is of another environment or run: {name} differ")
+        if manifest[name] != json.loads(json.dumps(own[name])):
+            differing.append(f"{name} differ")
+    if differing:
+        raise BadInput(f"{path}: its checkpoint is of another run or environment: "
+                       f"{'; '.join(differing)}")  # fmt: skip

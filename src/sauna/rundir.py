@@ -17,11 +17,13 @@ import json
 import os
 import platform
 import subprocess
+import time
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.checkpoint import sync_folder, write_durably
-from sauna.errors import BadInput
+from sauna.checkpoint import BadCheckpoint, sync_folder, write_durably
+from sauna.errors import BadInput, SaunaError
+from sauna.untrusted import JSON_BYTES, Untrusted, parse_object, read_file
 
 LOGS = ("metrics.jsonl", "timing.jsonl")
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
@@ -43,10 +45,16 @@ def create(path: Path) -> None:
     if path.exists() and (not path.is_dir() or any(map(_counts, path.iterdir()))):
         hint = f"; `sauna resume {path}` continues it" if (path / "config.json").exists() else ""
         raise BadInput(f"out: {path} is not empty{hint}")
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {path}: {error.strerror}") from error
+    for folder in made:
+        try:
+            sync_folder(folder.parent)
+        except PermissionError:  # of a folder that may be entered, but not read
+            continue
 
 
 def _counts(path: Path) -> bool:
@@ -67,15 +75,32 @@ def lock(path: Path) -> IO[str]:
     file = (path / ".lock").open("a+")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.seek(0)
-        holder = file.read().strip() or "unknown"
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+    except BlockingIOError:
+        holder = _holder(file)
         file.close()
         raise InUse(f"{path} is in use by process {holder}") from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
+    except OSError:
+        file.close()
+        raise
     return file
+
+
+def _holder(file: IO[str]) -> str:
+    """The number that the holder writes into the lock right after it has it.
+
+    Until then the file is empty or names the holder before, which may have been killed.
+    """
+    number = ""
+    for _ in range(100):
+        file.seek(0)
+        number = file.read().strip()
+        if number.isdigit() and Path(f"/proc/{number}").exists():
+            break
+        time.sleep(0.005)
+    return number or "unknown"
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -105,26 +130,38 @@ def read_config_file(path: Path) -> dict[str, Any]:
       BadInput: the file cannot be read as that.
     """
     try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        return parse_object(read_file(path.resolve(), JSON_BYTES))
+    except Untrusted as error:
         raise BadInput(f"config: cannot read {path}: {error}") from error
-    if not isinstance(value, dict):
-        raise BadInput(f"config: {path} does not hold a JSON object")
-    return value
 
 
 def rows(run: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
-    """All rows of a log; an unfinished last line (of a run in progress) is left out."""
+    """All rows of a log; an unfinished last line (of a run in progress) is left out.
+
+    So is everything behind a line that a power cut has spoilt: a resume cuts that off.
+
+    Raises:
+      SaunaError: a row of a complete run cannot be read; its line is named.
+    """
     path = run / name
+    found: list[dict[str, Any]] = []
     if not path.is_file():
-        return []
-    return [json.loads(line) for line in path.read_text().splitlines(True) if line.endswith("\n")]
+        return found
+    for number, line in enumerate(path.read_bytes().splitlines(True), 1):
+        try:
+            if line.endswith(b"\n"):
+                found.append(json.loads(line))
+        except ValueError as error:
+            if is_complete(run):
+                raise SaunaError(f"{path}: line {number} is damaged: {error}") from error
+            break
+    return found
 
 
 def is_complete(run: Path) -> bool:
     """Whether the run was trained to its end."""
     path = run / "summary.json"
-    return path.is_file() and bool(json.loads(path.read_text())["complete"])
+    return path.is_file() and bool(read_config_file(path).get("complete"))
 
 
 def log_sizes(run: Path) -> dict[str, int]:
@@ -137,18 +174,26 @@ def log_sizes(run: Path) -> dict[str, int]:
     return {name: (run / name).stat().st_size for name in LOGS if (run / name).exists()}
 
 
-def cut_logs(run: Path, sizes: dict[str, int]) -> None:
-    """Brings the logs back to a checkpoint: rows behind it will be written again.
+def check_logs(run: Path, sizes: dict[str, int]) -> None:
+    """Whether the logs still hold the rows that a checkpoint counts on.
 
     Raises:
-      BadInput: a log is shorter than the checkpoint says; rows were lost.
+      BadCheckpoint: a log is shorter than the checkpoint says; rows were lost.
     """
     for name in LOGS:
         path, size = run / name, sizes.get(name, 0)
         if (path.stat().st_size if path.exists() else 0) < size:
-            raise BadInput(f"{path} is shorter than when the checkpoint was saved; rows are lost")
+            raise BadCheckpoint(
+                f"{path} is shorter than when the checkpoint was saved; rows are lost"
+            )
+
+
+def cut_logs(run: Path, sizes: dict[str, int]) -> None:
+    """Brings the logs back to a checkpoint: rows behind it will be written again."""
+    for name in LOGS:
+        path = run / name
         if path.exists():
-            os.truncate(path, size)
+            os.truncate(path, sizes.get(name, 0))
 
 
 def versions() -> dict[str, str]:

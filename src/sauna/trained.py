@@ -13,7 +13,7 @@ from sauna.artifact import Artifact, check_spaces, find_member
 from sauna.core.normalize import Moments, normalize
 from sauna.core.policy import Policy, make_policy
 from sauna.envs.gymnasium import make_env
-from sauna.member_state import flat_params, under
+from sauna.member_state import fitting, flat_params, under
 from sauna.spaces import action_writer, observation_reader
 
 
@@ -46,7 +46,12 @@ class TrainedPolicy:
         zeros = jnp.zeros(example.shape, example.dtype)
         self._params = flat_params(self._policy, zeros, under("params/", own))
         if self.config.normalize_observations:
-            self._moments = Moments(**under("observation_moments/", own))
+            size = artifact.spaces.observation_shape
+            parts = {"mean": size, "variance": size, "count": (1,)}
+            self._moments = Moments(**{
+                name: fitting(own, f"observation_moments/{name}", np.zeros(shape))
+                for name, shape in parts.items()
+            })  # fmt: skip
         self._dtype = artifact.spaces.observation_dtype
         self._act = jax.jit(self._choose, static_argnames="deterministic")
 

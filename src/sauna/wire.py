@@ -7,6 +7,7 @@ or lock of the parent is never inherited.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import signal
@@ -29,7 +30,9 @@ class Message(NamedTuple):
 
 
 def send(
-    connection: Connection, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None
+    connection: Connection | Shared,
+    header: dict[str, Any],
+    arrays: dict[str, np.ndarray] | None = None,
 ) -> None:
     contiguous = {name: np.asarray(a, order="C") for name, a in (arrays or {}).items()}
     connection.send_bytes(save(contiguous, {"header": json.dumps(header)}))
@@ -50,6 +53,17 @@ def decode(blob: bytes) -> Message:
     return Message(json.loads(metadata["header"]), load(blob))
 
 
+class Shared:
+    """A connection that several threads may write to."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._lock = connection, threading.Lock()
+
+    def send_bytes(self, blob: bytes) -> None:
+        with self._lock:
+            self._connection.send_bytes(blob)
+
+
 class ThreadProcess:
     """A thread with as much of a process's face as `Worker` needs."""
 
@@ -57,6 +71,9 @@ class ThreadProcess:
 
     def __init__(self, thread: threading.Thread) -> None:
         self._thread = thread
+
+    def poll(self) -> int | None:
+        return None if self._thread.is_alive() else 0
 
     def wait(self, timeout: float | None = None) -> int:
         self._thread.join(timeout)
@@ -129,11 +146,20 @@ def child_ends(arguments: list[str]) -> tuple[Connection, Connection]:
     """In the child: `(inbox, outbox)` from its command line.
 
     Signals are the parent's business (schedulers send them to every process): a child ends when
-    its inbox closes.
+    its inbox closes, and is killed with its parent where it cannot notice that.
     """
+    _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return (
         Connection(int(arguments[0]), writable=False),
         Connection(int(arguments[1]), readable=False),
     )
+
+
+def _die_with_parent() -> None:
+    """Linux kills this process when its parent ends in any way, even where an environment hangs."""
+    try:
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
+    except (OSError, AttributeError):
+        pass  # another system: the closed inbox has to do

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Mapping
 from multiprocessing.connection import Connection
@@ -13,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from sauna.errors import SaunaError
-from sauna.wire import child_ends, receive, send
+from sauna.wire import Shared, child_ends, receive, send
+
+BEAT = 2.0  # seconds between two signs of life
 
 
 class PipeReporter:
@@ -23,7 +26,7 @@ class PipeReporter:
     stop at the same one. A coordinator that is gone ends the process.
     """
 
-    def __init__(self, inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
+    def __init__(self, inbox: Connection, outbox: Shared, dies_alone: bool) -> None:
         self._inbox, self._outbox, self._dies_alone = inbox, outbox, dies_alone
         self._granted = 0
         self._stop = False
@@ -63,8 +66,21 @@ class PipeReporter:
         send(self._outbox, {"kind": "state", "iteration": iteration}, arrays)
 
 
-def serve(inbox: Connection, outbox: Connection, dies_alone: bool) -> None:
+def _beat(outbox: Shared) -> None:
+    """Signs of life, also while an environment or the compiler takes its time."""
+    try:
+        while True:
+            send(outbox, {"kind": "alive"})
+            time.sleep(BEAT)
+    except OSError:
+        return  # nobody listens any more
+
+
+def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     """Receives a job, trains, and reports how it ended."""
+    outbox = Shared(outlet)
+    if dies_alone:
+        threading.Thread(target=_beat, args=(outbox,), daemon=True).start()
     try:
         header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})

@@ -20,8 +20,9 @@ from sauna import rundir
 from sauna.bench.rates import ratio
 from sauna.config import Config
 from sauna.errors import BadInput, SaunaError
+from sauna.placement import look_at, placed
 from sauna.presets import members, resolve
-from sauna.run import look_at, placed, plain, settle
+from sauna.run import plain, settle
 from sauna.worker import configure_jax
 
 # Numbers of environments that `--scale` tries, and of members.

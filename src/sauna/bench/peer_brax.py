@@ -12,8 +12,8 @@ import sys
 import time
 from typing import Any
 
+from sauna.placement import placed
 from sauna.presets import resolve
-from sauna.run import placed
 from sauna.worker import configure_jax
 
 EPOCHS = 4  # the first holds the compilation

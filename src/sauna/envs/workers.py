@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from sauna.spaces import read_spaces
 from sauna.wire import Message, child_ends, receive, send, start_worker
 
 STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
+NOTICE = 0.2  # seconds after which the end of a worker is noticed while another one is awaited
 ARRAYS = [name for name in Step._fields if name != "ended"]
 
 
@@ -103,7 +105,7 @@ class ProcessEnvs(HostEnvs):
         worker = self._workers[number]
         name = f"environment worker {number} (process {worker.process.pid})"
         timeout = timeout or self._timeout
-        if not worker.inbox.poll(timeout):
+        if not self._wait_for(number, timeout):
             worker.process.kill()
             raise EnvironmentFailure(f"{name} did not answer within {timeout:g} s")
         try:
@@ -114,6 +116,17 @@ class ProcessEnvs(HostEnvs):
         if message.header["kind"] == "failure":
             raise EnvironmentFailure(f"{name}: {message.header['message']}")
         return message
+
+    def _wait_for(self, number: int, timeout: float) -> bool:
+        """Whether a worker answers in time; another one's end is noticed meanwhile."""
+        end = time.monotonic() + timeout
+        while not self._workers[number].inbox.poll(min(NOTICE, max(end - time.monotonic(), 0.0))):
+            for other, worker in enumerate(self._workers):
+                if other != number and worker.process.poll() is not None:
+                    self._answer(other)  # its last words, or its exit code
+            if time.monotonic() >= end:
+                return False
+        return True
 
 
 def _serve(envs: GymnasiumEnvs, message: Message) -> dict[str, np.ndarray]:

@@ -14,7 +14,8 @@ from typing import Any
 from sauna import rundir
 from sauna.envs.probe import Probe
 from sauna.errors import BadInput, Interrupted
-from sauna.run import check_read_after_settling, look_at, placed, settle
+from sauna.placement import look_at, placed
+from sauna.run import check_read_after_settling, settle
 from sauna.study.local import LocalExecutor
 from sauna.study.results import gather, typed
 from sauna.study.schedule import Executor

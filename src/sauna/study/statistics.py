@@ -27,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, special, stats
+import scipy  # its parts are imported when they are used: a mistake is answered before that
 
 ALPHA = 0.05  # two-sided, for tests and intervals alike
 POWER = 0.8  # of the test that `seeds_needed` plans
@@ -61,7 +61,7 @@ def iqm(scores: np.ndarray) -> np.ndarray:
     The lowest and highest `floor(n / 4)` are left out, so with fewer than four scores it is the
     plain mean. Tasks may be pooled only where their scores share a scale.
     """
-    return stats.trim_mean(scores, 0.25, axis=-1)
+    return scipy.stats.trim_mean(scores, 0.25, axis=-1)
 
 
 def iqm_estimate(strata: Sequence[np.ndarray]) -> Estimate:
@@ -100,7 +100,7 @@ def performance_profile(
     share = (scores[:, None] >= thresholds).mean(0)
     if len(scores) < 2:
         return share, np.full_like(share, np.nan), np.full_like(share, np.nan)
-    low, high = (stats.binom.ppf(q, len(scores), share) / len(scores) for q in QUANTILES)
+    low, high = (scipy.stats.binom.ppf(q, len(scores), share) / len(scores) for q in QUANTILES)
     return share, low, high
 
 
@@ -142,13 +142,13 @@ def _lower_end(value: float, n: int, m: int) -> float:
     if top <= 0:
         return 0.0
     k = (n + m) / 2 - 1
-    z = special.ndtri(1 - ALPHA / 2)
+    z = scipy.special.ndtri(1 - ALPHA / 2)
 
     def excess(t: float) -> float:
         variance = t * (1 - t) * (1 + k * ((1 - t) / (2 - t) + t / (1 + t))) / (n * m)
         return top - t - z * math.sqrt(variance)
 
-    return float(optimize.brentq(excess, 0.0, top))
+    return float(scipy.optimize.brentq(excess, 0.0, top))
 
 
 def bootstrap_improvement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
@@ -200,11 +200,11 @@ def exact_p(x: np.ndarray, y: np.ndarray) -> float:
     n, m = len(x), len(y)
     if min(n, m) == 0:
         return 1.0
-    twice_ranks = np.rint(2 * stats.rankdata(np.concatenate([x, y]))).astype(int)
+    twice_ranks = np.rint(2 * scipy.stats.rankdata(np.concatenate([x, y]))).astype(int)
     if len(set(twice_ranks)) == 1:
         return 1.0
     if n + m > EXACT_UP_TO:
-        return float(stats.mannwhitneyu(x, y, method="asymptotic").pvalue)
+        return float(scipy.stats.mannwhitneyu(x, y, method="asymptotic").pvalue)
     chances = _rank_sum_chances(tuple(sorted(twice_ranks.tolist())), n)
     distance = np.abs(np.arange(len(chances)) - n * (n + m + 1))
     return min(1.0, float(chances[distance >= distance[twice_ranks[:n].sum()]].sum()))
@@ -251,7 +251,7 @@ def seeds_needed(chance: float, comparisons: int = 1, power: float = POWER) -> i
     """
     if chance == 0.5:
         return None
-    z = special.ndtri(1 - ALPHA / comparisons / 2) + special.ndtri(power)
+    z = scipy.special.ndtri(1 - ALPHA / comparisons / 2) + scipy.special.ndtri(power)
     return max(math.ceil(z**2 / (6 * (chance - 0.5) ** 2)), least_seeds(comparisons))
 
 
@@ -357,5 +357,5 @@ def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     mean = values.mean(0)
     if number < 2:
         return mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)
-    half = stats.t.isf(ALPHA / 2, number - 1) * values.std(0, ddof=1) / math.sqrt(number)
+    half = scipy.stats.t.isf(ALPHA / 2, number - 1) * values.std(0, ddof=1) / math.sqrt(number)
     return mean, mean - half, mean + half

@@ -1,0 +1,58 @@
+"""Where a run's environments are stepped: on the host or on the device, and on which."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+
+from sauna.config import Config
+from sauna.envs.native import is_native
+from sauna.envs.probe import Probe, probe, probe_on_device
+from sauna.errors import BadInput
+from sauna.machines import read_place
+from sauna.worker import configure_jax
+
+
+def placed(config: Config) -> Config:
+    """Resolves where the environments run, and on what.
+
+    Raises:
+      BadInput: a setting that is not read there.
+    """
+    if config.backend == "auto" and is_native(config.env, json.loads(config.env_kwargs)):
+        config = dataclasses.replace(config, backend="device")
+    if config.backend != "device":
+        return config
+    if config.env_processes:
+        raise BadInput("env_processes: not read with backend device")
+    if read_place(config.distributed).machines > 1 and config.devices:
+        raise BadInput("devices: not read with distributed, where every device takes part")
+    most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
+    if most >= 2**31:
+        raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")
+    device = config.device
+    if device == "gpu" and not has_gpu():
+        raise BadInput("device: no NVIDIA GPU here that JAX can use; "
+                       "`pip install 'sauna-rl[gpu]'` where there is one")  # fmt: skip
+    if device == "auto":
+        device = "gpu" if has_gpu() else "cpu"
+    return dataclasses.replace(config, device=device)
+
+
+def has_gpu() -> bool:
+    """Whether there is an NVIDIA GPU and a JAX that can use it; found without importing JAX."""
+    plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+    return Path("/proc/driver/nvidia/version").exists() and any(
+        importlib.util.find_spec(name) is not None for name in plugins
+    )
+
+
+def look_at(config: Config) -> Probe:
+    """What has to be known of the environment before a run starts."""
+    kwargs = json.loads(config.env_kwargs)
+    if config.backend != "device":
+        return probe(config.env, kwargs)
+    configure_jax()
+    return probe_on_device(config.env, kwargs)

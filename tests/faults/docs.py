@@ -1,0 +1,68 @@
+"""The figures of `docs/reliability.md`, from the files under `results/`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def write(page: Path, stored: dict[str, Any]) -> None:
+    """Puts what was measured between the page's markers; what was not says so."""
+    text = page.read_text()
+    for name, lines in (("campaign", _campaign(stored)), ("mutants", _mutants()),
+                        ("soak", _soak())):  # fmt: skip
+        begin, end = f"<!-- {name} begin -->\n", f"<!-- {name} end -->"
+        head, _, rest = text.partition(begin)
+        text = head + begin + "\n".join(lines) + "\n" + end + rest.partition(end)[2]
+    page.write_text(text)
+
+
+def _campaign(stored: dict[str, Any]) -> list[str]:
+    lines = ["| row | tried | lost | silent | worst time | of that |", "|---|---|---|---|---|---|"]
+    for number, row in stored["rows"].items():
+        notes = ", ".join(f"{name} {value:,}" for name, value in row["notes"].items())
+        lines.append(f"| {int(number)} {row['row']} | {row['tried']:,} | {row['lost']} | "
+                     f"{row['silent']} | {row['worst']:.3g} s | {notes} |")  # fmt: skip
+    machines = {f"{row['machine']['processor']}, {row['machine']['cores']} cores"
+                for row in stored["rows"].values()}  # fmt: skip
+    sources = {row["sources"] for row in stored["rows"].values()}
+    lines += ["", f"Measured on: {'; '.join(sorted(machines))}. Each row was measured with the "
+              f"package as it was then ({len(sources)} states of it; `results/reliability.json` "
+              f"names each row's)."]  # fmt: skip
+    return lines
+
+
+def _load(name: str) -> dict[str, Any] | None:
+    path = ROOT / "results" / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def _mutants() -> list[str]:
+    found = _load("mutants")
+    if found is None:
+        return ["Not measured yet."]
+    rest = found["mutants"] - found["equivalent"]
+    lines = [f"{found['caught']} of {rest} are caught ({found['share']:.1%}); "
+             f"{found['equivalent']} more make the same program."]  # fmt: skip
+    for row in found["rows"]:
+        if row["caught_by"] is None:
+            why = row["equivalent"] or "not caught"
+            lines.append(f"- `{row['name']}`: {why}")
+    return lines
+
+
+def _soak() -> list[str]:
+    found = _load("soak")
+    if found is None:
+        return ["Not measured yet."]
+    lines = [f"`{found['command']}`, {found['hours']:.2f} hours, {found['env_steps']:,} env steps.",
+             "", "| of all its processes | mean | largest | change per hour (95%) |",
+             "|---|---|---|---|"]  # fmt: skip
+    units = {"memory": "MiB of memory", "files": "open files", "threads": "threads"}
+    for name, row in found["slopes"].items():
+        change = f"{row['per_hour']:+.2f} ({row['low']:+.2f} to {row['high']:+.2f})"
+        lines.append(f"| {units[name]} | {row['mean']:,.1f} | {row['largest']:,.1f} | {change} |")
+    return lines

@@ -1,0 +1,299 @@
+"""Small mistakes planted in `core/` and `selection/`: which share of them do the fast tests catch?
+
+    python tests/faults/mutants.py                every mutant; results/mutants.json
+    python tests/faults/mutants.py --only NAME    those whose name contains NAME; nothing is stored
+
+Each mistake is made in a copy of the sources, and pytest runs on it: first the tests of that part,
+then all that are about numbers, then whole small trainings. The processes are forked from one that
+has imported JAX.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+RESULTS = ROOT / "results" / "mutants.json"
+QUICK = ("advantages", "losses", "filters", "vex", "networks", "collect", "reference", "properties")
+SLOW = ("probes", "population")  # for what the others let pass
+
+
+class Mutant(NamedTuple):
+    """`old` becomes `new` in a file of `src/sauna`; `tests` are those that should know it best."""
+
+    file: str
+    name: str
+    old: str
+    new: str
+    tests: str
+
+
+def _of(file: str, tests: str, *changes: tuple[str, str, str]) -> list[Mutant]:
+    return [Mutant(file, name, old, new, tests) for name, old, new in changes]
+
+
+MUTANTS = [
+    *_of("core/advantages.py", "advantages",
+        ("value is added", "* next_value - value\n", "* next_value + value\n"),
+        ("no bootstrap mask", "gamma * bootstrap * next_value", "gamma * next_value"),
+        ("no mask between episodes", "gae_lambda * goes_on_t * later", "gae_lambda * later"),
+        ("no lambda", "gamma * gae_lambda * goes_on_t", "gamma * goes_on_t"),
+        ("no gamma in the sum", "gamma * gae_lambda * goes_on_t", "gae_lambda * goes_on_t"),
+        ("forwards in time", "reverse=True", "reverse=False"),
+    ),
+    *_of("core/batch.py", "advantages reference vex",
+        ("dropped steps are kept", "jnp.argsort(~keep", "jnp.argsort(keep"),
+        ("stream goes on at its end", "zeros_like(rollout.valid[:1])])\n    bootstrap",
+         "ones_like(rollout.valid[:1])])\n    bootstrap"),
+        ("truncation never bootstraps", "~rollout.terminated if bootstrap_truncated else ~ended",
+         "~ended"),
+        ("truncation always bootstraps", "~rollout.terminated if bootstrap_truncated else ~ended",
+         "~rollout.terminated"),
+        ("episode ends leak", "~(ended | last)", "~last"),
+        ("truncated ends leak", "~(ended | last)", "~(rollout.terminated | last)"),
+        ("last kept step off by one", ">= number - 1", ">= number"),
+        ("ends of the wrong step", "take(ended_before, following)", "take(ended, following)"),
+        ("other value at the stream's end", "take(rollout.next_value, final_row)",
+         "take(rollout.value, final_row)"),
+        ("episodes start a step early", "jnp.cumsum(ended, 0) - ended", "jnp.cumsum(ended, 0)"),
+        ("return without its value", "return_ = advantage + value", "return_ = advantage"),
+        ("empty slots count", "weight = take(rollout.keep, rows).astype(jnp.float32)",
+         "weight = jnp.ones(value.shape, jnp.float32)"),
+        ("Vex of swapped arguments", "target.target(return_, value,",
+         "target.target(value, return_,"),
+        ("log-probabilities of other steps", "take(rollout.log_prob, rows)",
+         "take(rollout.log_prob, rows[::-1])"),
+    ),
+    *_of("core/losses.py", "losses",
+        ("mean over empty slots, too", "jnp.maximum(jnp.sum(weight), 1.0)", "weight.shape[0]"),
+        ("advantages not centred", "centred = advantage - weighted_mean(advantage, weight)",
+         "centred = advantage"),
+        ("advantages not scaled", "centred / (jnp.sqrt(weighted_mean(centred**2, weight)) + 1e-8)",
+         "centred"),
+        ("optimistic surrogate",
+         "jnp.maximum(-advantage * ratio", "jnp.minimum(-advantage * ratio"),
+        ("flipped advantage", "jnp.maximum(-advantage * ratio, -advantage * clipped)",
+         "jnp.maximum(advantage * ratio, advantage * clipped)"),
+        ("lower clip twice as wide", "1.0 - clip_range,", "1.0 - 2.0 * clip_range,"),
+        ("optimistic value clip", "jnp.maximum(error,", "jnp.minimum(error,"),
+        ("value error not halved", "return 0.5 * error", "return error"),
+        ("clip around zero", "old + jnp.clip(value - old", "jnp.clip(value - old"),
+        ("entropy is punished",
+         "policy_loss - hypers.entropy_coef", "policy_loss + hypers.entropy_coef"),
+        ("Vex weighted as value", "hypers.vex_coef * vex_loss", "hypers.value_coef * vex_loss"),
+        ("no value loss", "total + hypers.value_coef * value_loss +", "total +"),
+        ("KL with the wrong sign", "(ratio - 1.0) - log_ratio", "(ratio - 1.0) + log_ratio"),
+        ("clip fraction inverted",
+         "jnp.abs(ratio - 1.0) > hypers", "jnp.abs(ratio - 1.0) < hypers"),
+        ("masked ratios count", "jnp.where(weight > 0, log_ratio, 0.0)", "log_ratio"),
+    ),
+    *_of("core/normalize.py", "collect",
+        ("spread of the means forgotten", "moments.variance + delta * move", "moments.variance"),
+        ("mean moves the wrong way", "Moments(moments.mean + move", "Moments(moments.mean - move"),
+        ("no clip", ".clip(-clip, clip)", ""),
+        ("starts with a whole sample", "1e-4)", "1.0)"),
+        ("inactive rows count",
+         "number = weight.sum(-2)", "number = weight.sum(-2) * 0 + weight.shape[-2]"),
+        ("batch variance weighted by count", "batch_variance * fraction, total",
+         "batch_variance * (1 - fraction), total"),
+    ),
+    *_of("core/update.py", "losses faults/test_07_poisoned_batch",
+        ("uphill", "state.params - hypers.learning_rate * step",
+         "state.params + hypers.learning_rate * step"),
+        ("element-wise clipping", "optax.clip_by_global_norm(hypers.max_grad_norm)",
+         "optax.clip(hypers.max_grad_norm)"),
+        ("no clipping", "optax.clip_by_global_norm(hypers.max_grad_norm)", "optax.identity()"),
+        ("Adam forgets",
+         "return TrainState(params, adam)", "return TrainState(params, state.optimizer)"),
+        ("only the loss is checked", " & jnp.all(jnp.isfinite(state.params))", ""),
+        ("explained variance of a sum", "variance(return_ - value)", "variance(return_ + value)"),
+        ("median off by one", "ordered[(number - 1) // 2]", "ordered[number // 2]"),
+        ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
+    ),
+    *_of("core/policy.py", "networks reference",
+        ("value and Vex swapped", "[log_prob, output.value, output.vex]",
+         "[log_prob, output.vex, output.value]"),
+        ("acts without noise", "policy.apply(params, observation).policy, noise)",
+         "policy.apply(params, observation).policy, 0.0 * noise)"),
+    ),
+    *_of("core/distributions.py", "networks",
+        ("density not normalised",
+         "jnp.sum(log_std, -1) - constant", "jnp.sum(log_std, -1) + constant"),
+        ("noise scaled by the logarithm",
+         "mean + jnp.exp(log_std) * noise", "mean + log_std * noise"),
+        ("entropy without its constant",
+         "(1.0 + math.log(2.0 * math.pi))", "math.log(2.0 * math.pi)"),
+        ("bits inverted", "(parameters > 0).astype", "(parameters < 0).astype"),
+        ("categorical entropy flipped",
+         "sum(-jnp.sum(jnp.exp(log_p)", "sum(jnp.sum(jnp.exp(log_p)"),
+    ),
+    *_of("core/networks.py", "networks",
+        ("policy head starts large", 'self.num_outputs, 0.01, "policy_head"',
+         'self.num_outputs, 1.0, "policy_head"'),
+        ("Vex on the policy's trunk",
+         '"vex_head")(value_features)', '"vex_head")(policy_features)'),
+        ("activations swapped",
+         '"tanh": nn.tanh, "relu": nn.relu', '"tanh": nn.relu, "relu": nn.tanh'),
+        ("pixels not scaled", "x.astype(jnp.float32) / 255.0", "x.astype(jnp.float32)"),
+    ),
+    *_of("core/population.py", "losses collect reference population",
+        ("noise repeats in a rollout",
+         "jax.random.fold_in(jax.random.fold_in(root, iteration), block)",
+         "jax.random.fold_in(root, iteration)"),
+        ("minibatches repeat", "default_rng([seed, iteration])", "default_rng([seed])"),
+        ("one order for all members", "default_rng([seed, iteration])", "default_rng([iteration])"),
+        ("minibatches in time order",
+         "generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)",
+         "np.tile(samples, (config.epochs, 1))"),
+        ("one key for all members", "jax.random.key(seed)", "jax.random.key(0)"),
+    ),
+    *_of("selection/filters.py", "filters reference",
+        ("median off by one", "jnp.maximum(history.number - 1, 0) // 2", "history.number // 2"),
+        ("history does not grow",
+         "History(ordered, history.number + 1)", "History(ordered, history.number)"),
+        ("filter inverted", "~(ratio < threshold)", "~(ratio > threshold)"),
+        ("strict threshold", "~(ratio < threshold)", "~(ratio <= threshold)"),
+        ("first step compared with nothing", "(history.number == 0) | ", ""),
+        ("sign of Vex counts", "jnp.abs(vex) /", "vex /"),
+        ("sign of the median counts",
+         "(jnp.abs(median(history)) + EPSILON)", "(median(history) + EPSILON)"),
+        ("joint decision by the largest", "jnp.mean(vex), state", "jnp.max(vex), state"),
+        ("random drop inverted", ">= hypers.drop_rate", "< hypers.drop_rate"),
+        ("one key for every stretch",
+         "jax.random.fold_in(key, first + t)", "jax.random.fold_in(key, t)"),
+        ("one step too many", "carry[0] < length", "carry[0] <= length"),
+    ),
+    *_of("selection/vex.py", "vex",
+        ("unexplained instead of explained", "jnp.where(varies, 1.0 - unexplained /",
+         "jnp.where(varies, unexplained /"),
+        ("constant returns are explained", "jnp.where(varies, variance, 1.0), 0.0)",
+         "jnp.where(varies, variance, 1.0), 1.0)"),
+        ("minibatch residual not centred",
+         "_mean((residual - _mean(residual, weight)) ** 2, weight)",
+         "_mean(residual**2, weight)"),
+        ("stretches not centred", "over_stretch((return_ - over_stretch(return_)) ** 2)",
+         "over_stretch(return_**2)"),
+        ("other clip", "CLIP_BELOW = -5.0", "CLIP_BELOW = -10.0"),
+        ("rounding counts as variance", "ROUNDING = 1e-8", "ROUNDING = 0.0"),
+        ("samples of weight 0 count", "jnp.sum(x * weight, 0, keepdims=True)",
+         "jnp.sum(x, 0, keepdims=True)"),
+        ("minibatch target once per rollout", "minibatch_target, per_minibatch=True",
+         "minibatch_target"),
+    ),
+]  # fmt: skip
+
+# Survivors that are no mistakes: the program they make is the same one.
+EQUIVALENT: dict[str, str] = {}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", default="")
+    given = parser.parse_args()
+    chosen = [m for m in MUTANTS if given.only in f"{m.file}: {m.name}"]
+    os.environ.update(JAX_PLATFORMS="cpu", PJRT_NPROC="1", OMP_NUM_THREADS="1")
+    _import_libraries()
+    with tempfile.TemporaryDirectory() as place:
+        copy = Path(place) / "src"
+        shutil.copytree(ROOT / "src", copy, ignore=shutil.ignore_patterns("__pycache__"))
+        broken = _failing_test(copy, QUICK)
+        log = (copy.parent / "log").read_text()[-3000:]
+        assert broken is None, f"{broken} fails on the sources as they are\n{log}"
+        found = [_try(mutant, copy) for mutant in chosen]
+    caught = sum(row["caught_by"] is not None for row in found)
+    alike = sum(row["equivalent"] is not None for row in found)
+    print(f"{caught} of {len(found)} caught, {alike} equivalent")
+    if not given.only:
+        share = caught / (len(found) - alike)
+        result = {"mutants": len(found), "caught": caught, "equivalent": alike, "share": share,
+                  "rows": found}  # fmt: skip
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    return int(caught + alike < len(found))
+
+
+def _import_libraries() -> None:
+    """Before forking; not our own package, which each child imports from its copy."""
+    import flax.linen
+    import gymnasium
+    import hypothesis
+    import jax
+    import numba
+    import optax
+    import pytest
+    import scipy.stats
+
+    del flax, gymnasium, hypothesis, jax, numba, optax, pytest, scipy
+
+
+def _try(mutant: Mutant, copy: Path) -> dict[str, Any]:
+    path, name = copy / "sauna" / mutant.file, f"{mutant.file}: {mutant.name}"
+    plain = path.read_text()
+    assert plain.count(mutant.old) == 1, f"{name}: {plain.count(mutant.old)} places"
+    clock = time.monotonic()
+    path.write_text(plain.replace(mutant.old, mutant.new))
+    try:
+        stages = (tuple(mutant.tests.split()), QUICK, SLOW)
+        caught = next(filter(None, (_failing_test(copy, stage) for stage in stages)), None)
+    finally:
+        path.write_text(plain)
+    row = {"name": name, "caught_by": caught, "equivalent": EQUIVALENT.get(name),
+           "seconds": round(time.monotonic() - clock, 1)}  # fmt: skip
+    print(json.dumps(row), flush=True)
+    return row
+
+
+def _failing_test(copy: Path, tests: tuple[str, ...]) -> str | None:
+    """The first test that fails on the copy, or None."""
+    log = copy.parent / "log"
+    shutil.rmtree(copy.parent / "__pycache__", ignore_errors=True)
+    pid = os.fork()
+    if pid == 0:
+        _test(copy, tests, log)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    if code == 0:
+        return None
+    found = re.search(r"^(?:FAILED|ERROR) (\S+)", log.read_text(), re.M)
+    return found.group(1) if found else f"pytest ended with {code}"
+
+
+def _test(copy: Path, tests: tuple[str, ...], log: Path) -> None:
+    import pytest
+
+    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(out, 1)
+    os.dup2(out, 2)
+    os.chdir(ROOT)
+    os.environ["PYTHONPATH"] = str(copy)
+    sys.path[:0] = [str(copy), str(ROOT / "tests")]
+    sys.dont_write_bytecode = True
+    _same_examples_each_time()
+    files = [f"tests/{t}.py" if "/" in t else f"tests/test_{t}.py" for t in tests]
+    code = 1
+    try:
+        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=short", *files]))
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+def _same_examples_each_time() -> None:
+    """A mutant must not be caught by luck, nor by a machine that is slow."""
+    from hypothesis import HealthCheck, settings
+
+    settings.register_profile(
+        "mutants", derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+    )
+    settings.load_profile("mutants")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

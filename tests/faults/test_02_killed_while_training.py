@@ -1,0 +1,73 @@
+"""Row 2: SIGKILL at any moment; what is left is a prefix of the run left alone, to the bit."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from pathlib import Path
+
+from faults.chain import Chain, Stage, children, is_saving, orphans, send, wait_for_rows, wait_until
+from faults.result import Result, Tally, assert_held
+
+AIMS = ("save", "save", "rows", "start")
+CHAIN = 25  # kills of one run
+
+
+def experiment(kills: int, seed: int, place: Path) -> Result:
+    """Kills runs again and again, in chains of 25 kills of one run.
+
+    A third of the kills hit the coordinator alone, whose workers then have to end by themselves;
+    every tenth process is started as a user starts it. `worst`: seconds from a resume's start to
+    its first new row.
+    """
+    with Stage(place) as stage:
+        return _kill_again_and_again(stage, kills, seed, place)
+
+
+def _kill_again_and_again(stage: Stage, kills: int, seed: int, place: Path) -> Result:
+    rng, tally = random.Random(seed), Tally()
+    chain, in_chain = stage.chain(place / "run", tally), 0
+    while tally.tried < kills:
+        in_chain += _kill(chain, rng, tally, fresh=tally.tried % 10 == 9)
+        if in_chain == CHAIN or chain.is_complete() or tally.tried == kills:
+            if not chain.is_complete():
+                chain.finish()
+            tally.notes["longest chain"] = max(tally.notes.get("longest chain", 0), in_chain)
+            chain, in_chain = stage.chain(place / "run", tally), 0
+    return tally.result()
+
+
+def _kill(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> bool:
+    """Starts the run and kills it; False if it had ended before."""
+    aim, clock = rng.choice(AIMS), time.monotonic()
+    process = chain.start(fresh)
+    if aim == "start":
+        time.sleep(rng.uniform(0.0, 4.0))
+    elif wait_for_rows(chain, process, 1):
+        tally.took(time.monotonic() - clock)
+        wait_for_rows(chain, process, rng.randrange(1, 15_000))
+    if aim == "save":
+        wait_until(lambda: is_saving(chain.run), process, 20.0, 0.0002)
+        time.sleep(rng.choice([0.0, 0.0, rng.uniform(0.0, 0.004)]))
+    workers = children(process.pid)
+    send(process.pid, signal.SIGKILL)
+    if rng.random() < 0.67:
+        for pid in workers:
+            send(pid, signal.SIGKILL)
+    if process.wait(30.0) != -signal.SIGKILL:
+        return False
+    tally.tried += 1
+    tally.count(f"aimed at: {aim}")
+    left = list((chain.run / "checkpoints").glob(".writing-*"))
+    saved = list((chain.run / "checkpoints").glob("[0-9]" * 8))
+    if left or len(saved) > 2:
+        tally.count("inside a save")
+    if orphans(workers, 5.0):
+        tally.lose("a worker outlived its coordinator")
+    chain.judge(f"kill {tally.tried} (aimed at {aim})")
+    return True
+
+
+def test_killed_at_any_moment_it_goes_on_to_the_same_bytes(stage: Stage, tmp_path: Path) -> None:
+    assert_held(_kill_again_and_again(stage, 3, 1, tmp_path), 3)

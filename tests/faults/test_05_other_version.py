@@ -1,0 +1,162 @@
+"""Row 5: a checkpoint of another version, environment or network is refused by the field."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sauna
+from faults.canned import Trap, played_back, record, until
+from faults.disk import tree_of
+from faults.make_golden import GOLDEN
+from faults.result import Result, Tally, assert_held
+from sauna import checkpoint, rundir
+from sauna.artifact import load_artifact
+from sauna.config import FIELDS, TYPES
+from sauna.errors import BadInput, SaunaError
+from sauna.run import RESUMABLE
+
+# A value of the same type that is another one, where adding 1 would not be.
+OTHERS = {"env": "worlds:Forgetful", "env_kwargs": {"speed": 2}, "arm": ["sauna"], "seeds": [7],
+          "preset": "mujoco-release", "hidden": [8, 9], "drop_rate_from": "elsewhere",
+          "gamma": 0.5, "gae_lambda": 0.5, "drop_rate": 0.25}  # fmt: skip
+
+
+def experiment(least: int, seed: int, place: Path) -> Result:
+    """Changes each setting, space, member and format. `worst`: seconds of the slowest refusal."""
+    rng, tally = random.Random(seed), Tally()
+    whole = place / "whole"
+    with played_back(record()):
+        until(whole, Trap())
+        (whole / "summary.json").unlink()
+        names = [name for name in FIELDS if name not in (*RESUMABLE, "out")]
+        for name in names if least >= 40 else rng.sample(names, least - 3):
+            _change_setting(whole, place / "run", name, tally)
+        for name in ("format", "spaces", "members"):
+            _change_manifest(whole, place / "run", name, tally)
+    return tally.result()
+
+
+def _change_setting(whole: Path, run: Path, name: str, tally: Tally) -> None:
+    """In the run's config, so that its checkpoints are those of another run."""
+    _copy(whole, run)
+    path = run / "config.json"
+    stored = json.loads(path.read_text())
+    before = stored["config"][name]
+    stored["config"][name] = _other(name, before)
+    path.write_text(json.dumps(stored))
+    refuser = "env" if name == "env_kwargs" else name  # the environment cannot be made with them
+    _expect_refusal(run, refuser, f"setting {name}", tally)
+
+
+def _other(name: str, value: Any) -> Any:
+    if name in OTHERS:
+        return OTHERS[name]
+    if FIELDS[name].metadata["choices"]:
+        return next(c for c in FIELDS[name].metadata["choices"] if c != value and c != "auto")
+    return not value if TYPES[name] is bool else value + 1
+
+
+def _change_manifest(whole: Path, run: Path, name: str, tally: Tally) -> None:
+    """In the newest checkpoint's manifest, with the right digest: another run's, as it was."""
+    _copy(whole, run)
+    newest = checkpoint.numbered(run / "checkpoints")[-1]
+    manifest = json.loads((newest / "manifest.json").read_text())
+    change = {"format": checkpoint.FORMAT + 1, "spaces": ["vector", [9]], "members": ["ppo/9"]}
+    manifest[name] = change[name]
+    manifest["manifest_sha256"] = checkpoint._digest(manifest)
+    (newest / "manifest.json").write_text(json.dumps(manifest))
+    _expect_refusal(run, name, f"manifest {name}", tally)
+
+
+def _copy(whole: Path, run: Path) -> None:
+    """The newest state is unreadable: a refusal has to come before tensors are loaded."""
+    shutil.rmtree(run, ignore_errors=True)
+    shutil.copytree(whole, run)
+    newest = checkpoint.numbered(run / "checkpoints")[-1]
+    (newest / "state.safetensors").write_bytes(b"unreadable")
+
+
+def _expect_refusal(run: Path, name: str, what: str, tally: Tally) -> None:
+    before = _tree(run)
+    clock = time.perf_counter()
+    try:
+        sauna.resume(run, quiet=True)
+        tally.miss(f"{what}: was resumed")
+    except SaunaError as error:
+        if name not in str(error) or "SHA-256" in str(error):
+            tally.miss(f"{what}: refused as {error}")
+    tally.took(time.perf_counter() - clock)
+    tally.tried += 1
+    if _tree(run) != before:
+        tally.lose(f"{what}: something was changed")
+
+
+def _tree(run: Path) -> dict[str, bytes | None]:
+    return {name: data for name, data in tree_of(run).items() if name != ".lock"}
+
+
+def test_what_belongs_to_another_run_is_refused_by_the_field(tmp_path: Path) -> None:
+    assert_held(experiment(15, 0, tmp_path), 15)
+
+
+def test_every_field_that_differs_is_named(tmp_path: Path) -> None:
+    with played_back(record()):
+        until(tmp_path / "run", Trap())
+        (tmp_path / "run" / "summary.json").unlink()
+        path = tmp_path / "run" / "config.json"
+        stored = json.loads(path.read_text())
+        stored["config"] |= {"gamma": 0.5, "clip_range": 0.1}
+        path.write_text(json.dumps(stored))
+        with pytest.raises(BadInput, match=r"clip_range is 0\.2, not 0\.1; gamma is 0\.99, not 0"):
+            sauna.resume(tmp_path / "run", quiet=True)
+
+
+def test_an_older_format_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Format 0 never was: the chain of migrations is what is tested."""
+    path = checkpoint.save_checkpoint(tmp_path, 3, {"a": np.arange(3.0)}, {"logs": {}}, 1)
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["names"] = manifest.pop("members", ["ppo/0"])
+    manifest["format"] = 0
+    manifest["manifest_sha256"] = checkpoint._digest(manifest)
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(checkpoint.BadCheckpoint, match="not a checkpoint of format"):
+        checkpoint.load_checkpoint(path)
+
+    def rename(old: dict[str, Any]) -> dict[str, Any]:
+        return {**old, "members": old.pop("names"), "format": 1}
+
+    monkeypatch.setitem(checkpoint.MIGRATIONS, 0, rename)
+    assert checkpoint.load_checkpoint(path).manifest["members"] == ["ppo/0"]
+
+
+@pytest.mark.parametrize("golden", sorted(GOLDEN.iterdir()), ids=lambda path: path.name)
+def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path, capsys) -> None:
+    """Its rows are kept, its policy acts, and it is trained to its end."""
+    run = tmp_path / "run"
+    shutil.copytree(golden, run)
+    loaded = load_artifact(run)
+    assert loaded.checkpoint.manifest["format"] == checkpoint.FORMAT
+    assert sauna.load(run)(np.zeros(3)).shape == (2,)
+    sauna.resume(run)
+    assert rundir.is_complete(run)
+    kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
+    rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()
+    assert rows[:kept] == old[:kept] and len(rundir.rows(run)) == 6
+
+
+def test_other_versions_of_the_libraries_are_told(tmp_path: Path, capsys, monkeypatch) -> None:
+    with played_back(record()):
+        until(tmp_path / "run", Trap())
+        (tmp_path / "run" / "summary.json").unlink()
+        plain = rundir.versions()
+        monkeypatch.setattr(rundir, "versions", lambda: {**plain, "jax": "9.9.9"})
+        sauna.resume(tmp_path / "run")
+    assert f"jax {plain['jax']} -> 9.9.9" in capsys.readouterr().out

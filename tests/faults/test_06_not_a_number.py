@@ -1,0 +1,146 @@
+"""Row 6: NaN or infinity from an environment is refused by name, before anything learns from it."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sauna
+from faults.result import Result, Tally, assert_held
+from helpers import SMALL, make_job, train_here
+from sauna import checkpoint, rundir
+from sauna.collect.host import HostCollector
+from sauna.core.population import make_program, member_keys
+from sauna.core.types import Hypers
+from sauna.envs.contract import HostEnvs
+from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
+from sauna.envs.workers import ProcessEnvs
+from sauna.errors import SaunaError
+
+SEEDS = [(3, 0), (3, 1), (5, 0)]
+FIELDS = ("first", "observation", "final", "reward")
+VALUES = ("nan", "inf", "-inf")
+# A new backend joins the matrix by a line here.
+BACKENDS = {
+    "in-process": lambda kwargs: GymnasiumEnvs(env_maker("worlds:Poisoned", kwargs), SEEDS),
+    "workers": lambda kwargs: ProcessEnvs("worlds:Poisoned", kwargs, SEEDS, 2, timeout=60.0),
+}
+
+
+def cases() -> list[dict[str, Any]]:
+    """Every field x value x component (of observations) x place in the run."""
+    found = []
+    for field, value, episode in itertools.product(FIELDS, VALUES, (1, 3)):
+        for component in (0, 2) if field != "reward" else (0,):
+            for step in (1, 2) if field in ("observation", "reward") else (1,):
+                found.append({"field": field, "value": value, "component": component,
+                              "episode": episode, "step": step})  # fmt: skip
+    return found
+
+
+def experiment(least: int, seed: int, place: Path) -> Result:
+    """The matrix in one process, and a part of it in workers; then inside of a rollout.
+
+    `worst`: seconds from the step that gave the number to the error.
+    """
+    rng, tally, everything = random.Random(seed), Tally(), cases()
+    chosen = everything if least >= 50 else rng.sample(everything, least)
+    for kwargs in chosen:
+        _play("in-process", kwargs, tally)
+    for kwargs in rng.sample(chosen, max(1, len(chosen) // 10)):
+        _play("workers", kwargs, tally)
+    for kwargs in rng.sample(everything, 4 if least >= 50 else 1):
+        _collect(kwargs, tally)
+    return tally.result()
+
+
+def _play(backend: str, kwargs: dict[str, Any], tally: Tally) -> None:
+    tally.tried += 1
+    tally.count(backend)
+    envs: HostEnvs = BACKENDS[backend](kwargs)
+    try:
+        message = _until_refused(envs, tally)
+    finally:
+        envs.close()
+    _check_message(message, kwargs, f"{backend}: {kwargs}", tally)
+
+
+def _until_refused(envs: HostEnvs, tally: Tally) -> str:
+    everyone = np.ones(len(SEEDS), bool)
+    clock = time.perf_counter()
+    try:
+        envs.reset()
+        for _ in range(200):
+            clock = time.perf_counter()
+            step = envs.step(np.zeros((len(SEEDS), 2), np.float32), everyone)
+            ended = step.terminated | step.truncated
+            numbers = [step.observation, step.reward, step.final_observation[ended]]
+            if not all(np.isfinite(part).all() for part in numbers):
+                return "it got through"
+    except EnvironmentFailure as error:
+        tally.took(time.perf_counter() - clock)
+        return str(error)
+    return "nothing was refused"
+
+
+def _check_message(message: str, kwargs: dict[str, Any], what: str, tally: Tally) -> None:
+    """It names the environment, the episode, the step and the field with its value."""
+    name = "reward" if kwargs["field"] == "reward" else f"observation[{kwargs['component']}]"
+    wanted = [" of seed ", f"episode {kwargs['episode'] - 1}, step ",
+              f"{name} is {kwargs['value']}"]  # fmt: skip
+    if "got through" in message or "nothing" in message:
+        tally.miss(f"{what}: {message}")
+    elif not all(part in message for part in wanted):
+        tally.lose(f"{what}: says {message!r}, without {wanted}")
+
+
+def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
+    """Inside of a rollout: the moments that normalise must not have seen it."""
+    job = make_job("worlds:Scripted", arm="ppo", envs=3, rollout_steps=64, steps=192)
+    envs = BACKENDS["in-process"](kwargs)
+    program, key = make_program(job.config, job.spaces), member_keys(0)
+    collector = HostCollector(program, job.spaces, envs, [key])
+    hypers = Hypers(*(np.float32(0.5) for _ in Hypers._fields))
+    tally.tried += 1
+    tally.count("inside of a rollout")
+    try:
+        collector.start()
+        params = np.stack([np.asarray(program.init(key.init).params)])
+        collector.collect(params, [hypers], 0, np.array([64]))
+        tally.miss(f"{kwargs}: a rollout was filled with it")
+    except EnvironmentFailure:
+        pass
+    moments = collector.observation_moments
+    assert moments is not None
+    parts = [moments.mean, moments.variance, collector._observed, *collector.reward_moments]
+    if not all(np.isfinite(part).all() for part in parts):
+        tally.miss(f"{kwargs}: it reached the moments or the buffer")
+
+
+def test_no_number_that_is_none_is_learned_from(tmp_path: Path) -> None:
+    assert_held(experiment(20, 0, tmp_path), 20)
+
+
+def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
+    """A run of several iterations: the last checkpoint is good, and it stops there again."""
+    run = tmp_path / "run"
+    kwargs = '{"field": "reward", "value": "nan", "episode": 25}'
+    with pytest.raises(SaunaError, match=r"environment 0 of seed 0, episode \d+.*reward is nan"):
+        sauna.train("worlds:Poisoned", env_kwargs=kwargs, out=run, quiet=True, arm="ppo",
+                    checkpoint_every=1, **{**SMALL, "steps": 3200})  # fmt: skip
+    found = checkpoint.load_newest(run / "checkpoints", print)
+    assert found is not None and found.manifest["iteration"] == len(rundir.rows(run)) > 1
+    assert not rundir.is_complete(run)
+
+
+def test_a_recorded_training_that_fails_has_reported_nothing_of_the_iteration() -> None:
+    job = make_job("worlds:Poisoned", arm="ppo", steps=3200, checkpoint_every=1,
+                   env_kwargs='{"field": "final", "value": "inf", "episode": 25}')  # fmt: skip
+    with pytest.raises(EnvironmentFailure, match="is inf"):
+        train_here(job)

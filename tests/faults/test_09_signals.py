@@ -1,0 +1,79 @@
+"""Row 9: the first signal finishes the iteration and saves, a second one stops at once."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from pathlib import Path
+
+from faults.chain import PATIENCE, Chain, Stage, children, orphans, send, wait_for_rows
+from faults.result import Result, Tally, assert_held
+from sauna import checkpoint
+
+
+def experiment(signals: int, seed: int, place: Path) -> Result:
+    """Stops runs with SIGINT and SIGTERM at random moments, one in four twice.
+
+    `worst`: seconds from the first signal to the end of the process.
+    """
+    with Stage(place) as stage:
+        return _stop_again_and_again(stage, signals, seed, place)
+
+
+def _stop_again_and_again(stage: Stage, signals: int, seed: int, place: Path) -> Result:
+    rng, tally = random.Random(seed), Tally()
+    chain = stage.chain(place / "run", tally)
+    while tally.tried < signals:
+        _signal(chain, rng, tally, fresh=tally.tried % 10 == 9)
+        if chain.is_complete() or tally.tried == signals:
+            if not chain.is_complete():
+                chain.finish()
+            chain = stage.chain(place / "run", tally)
+    return tally.result()
+
+
+def _signal(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> None:
+    process = chain.start(fresh)
+    number, twice = rng.choice([signal.SIGINT, signal.SIGTERM]), rng.random() < 0.25
+    if rng.random() < 0.2:
+        time.sleep(rng.uniform(0.3, 4.0))
+    else:
+        wait_for_rows(chain, process, rng.randrange(1, 20_000))
+    workers, clock = children(process.pid), time.monotonic()
+    send(process.pid, number)
+    if twice:
+        time.sleep(rng.uniform(0.0, 0.1))
+        send(process.pid, number)
+    code = process.wait(PATIENCE)
+    tally.tried += 1
+    tally.took(time.monotonic() - clock)
+    what = f"{signal.Signals(number).name}{' twice' if twice else ''} {tally.tried}"
+    if code is None:
+        tally.lose(f"{what}: still running")
+        process.kill()
+    elif (128 - code if code < 0 else code) != 128 + number and not chain.is_complete():
+        tally.lose(f"{what}: exit code {code}: {process.said()[-300:]}")
+    if orphans(workers, 5.0):
+        tally.lose(f"{what}: a worker outlived its coordinator")
+    chain.judge(what)
+    _count(chain, process.said(), tally, what)
+
+
+def _count(chain: Chain, said: str, tally: Tally, what: str) -> None:
+    """How it ended; after an orderly stop no row may be behind the checkpoint."""
+    if chain.is_complete():
+        tally.count("came when the run was over")
+    elif "stopped at once" in said:
+        tally.count("second signal stopped at once")
+    elif "after iteration" in said:
+        tally.count("finished the iteration and saved")
+        found = checkpoint.load_newest(chain.run / "checkpoints", print)
+        if not found or found.manifest["logs"]["metrics.jsonl"] != chain.rows():
+            tally.lose(f"{what}: rows behind the checkpoint after an orderly stop")
+    else:
+        tally.count("came before training began")
+
+
+def test_a_signal_saves_and_a_second_one_leaves_a_safe_state(stage: Stage, tmp_path: Path) -> None:
+    assert_held(_stop_again_and_again(stage, 3, 2, tmp_path), 3)

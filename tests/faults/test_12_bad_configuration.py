@@ -1,0 +1,259 @@
+"""Row 12: a mistake is answered in one line that names it, at once, and creates nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from faults.nursery import environment
+from faults.result import Result, Tally, assert_held
+from sauna import cli
+from sauna.config import FIELDS, TYPES, flag
+from sauna.presets import ARMS, PRESETS
+
+SECONDS = 1.0  # of CPU
+WORLD = "worlds:Scripted"
+COMMANDS = ("train", "compare", "study", "resume", "eval", "bench", "list")
+
+
+class Mistake(NamedTuple):
+    """A command line (`{file}` stands for a file that holds `text`), and what has to be said."""
+
+    arguments: list[str]
+    said: str
+    text: str = ""
+
+
+def typo(word: str, rng: random.Random) -> str:
+    """One letter of `word` left out, doubled or swapped with its neighbour."""
+    at = rng.randrange(1, len(word) - 1)
+    kind = rng.randrange(3)
+    if kind == 0:
+        return word[:at] + word[at + 1 :]
+    if kind == 1:
+        return word[:at] + word[at] + word[at:]
+    return word[:at] + word[at + 1] + word[at] + word[at + 2 :]
+
+
+def wrong_flag(rng: random.Random) -> Mistake:
+    known = [flag(name) for name in FIELDS if name != "env" and len(name) > 4]
+    name = rng.choice(known)
+    wrong = name
+    while wrong in known or wrong == name:
+        wrong = "--" + typo(name[2:], rng)
+    return Mistake(
+        ["train", WORLD, f"{wrong}=1"], f"unknown argument '{wrong}=1'; did you mean '--"
+    )
+
+
+def out_of_bounds(rng: random.Random) -> Mistake:
+    names = [n for n, f in FIELDS.items() if f.metadata["at_least"] is not None
+             or f.metadata["above"] is not None or f.metadata["at_most"] is not None]  # fmt: skip
+    name = rng.choice(names)
+    meta = FIELDS[name].metadata
+    values = ["nan", "inf", "-inf"] if TYPES[name] is float else []
+    if meta["at_least"] is not None:
+        values.append(str(meta["at_least"] - 1))
+    if meta["above"] is not None:
+        values.append(str(meta["above"]))
+    if meta["at_most"] is not None:
+        values.append(str(meta["at_most"] + 0.5))
+    return Mistake(["train", WORLD, f"{flag(name)}={rng.choice(values)}"], f"{name}: must be ")
+
+
+def unreadable(rng: random.Random) -> Mistake:
+    texts = {int: ["1.5", "ten", "", "1e", "0x10", "--"], float: ["", "a", "1,5", "1e", "-"]}
+    names = [n for n in FIELDS if TYPES[n] in texts and n != "env"]
+    name = rng.choice(names)
+    return Mistake(["train", WORLD, f"{flag(name)}={rng.choice(texts[TYPES[name]])}"],
+                   f"{name}: cannot read")  # fmt: skip
+
+
+def unknown_choice(rng: random.Random) -> Mistake:
+    names = [n for n, f in FIELDS.items() if f.metadata["choices"]]
+    name = rng.choice(names)
+    word = rng.choice([c for c in FIELDS[name].metadata["choices"] if len(c) > 2])
+    wrong = word + rng.choice(["x", "s", "_"])
+    arm = "sauna" if name != "backend" else "ppo"
+    return Mistake(["train", WORLD, "--arm", arm, flag(name), wrong],
+                   f"{name}: unknown value '{wrong}'")  # fmt: skip
+
+
+def unknown_name(rng: random.Random) -> Mistake:
+    kind, known = rng.choice([("arm", ARMS), ("preset", PRESETS)])
+    word = rng.choice(sorted(known))
+    wrong = word
+    while wrong in known:
+        wrong = typo(word, rng)
+    return Mistake(["train", WORLD, f"--{kind}", wrong], f"unknown {kind} '{wrong}'")
+
+
+def unread_setting(rng: random.Random) -> Mistake:
+    name, value = rng.choice([("threshold", "0.5"), ("history", "all"), ("dropped", "mask"),
+                              ("max_env_steps_factor", "2"), ("drop_rate", "0.1"),
+                              ("env_timeout", "5")])  # fmt: skip
+    return Mistake(["train", WORLD, "--arm", "ppo", flag(name), value], f"{name}: not read by arm")
+
+
+def impossible_together(rng: random.Random) -> Mistake:
+    return rng.choice([
+        Mistake(["train", WORLD, f"--minibatches={rng.choice([33, 7, 1000])}"], "minibatches:"),
+        Mistake(["train", WORLD, f"--steps={rng.randrange(1, 2048)}"], "steps:"),
+        Mistake(["train", WORLD, "--seeds", f"{(n := rng.randrange(99))},{n}"], "seeds:"),
+        Mistake(["train", WORLD, f"--seeds={-rng.randrange(1, 99)},1"], "seeds:"),
+        Mistake(["train", WORLD, "--arm", "random-drop"], "drop_rate:"),
+        Mistake(["train", WORLD, "--gae-over", "kept"], "gae_over:"),
+        Mistake(["train", WORLD, "--arm", "sauna,random-drop", "--drop-rate", "0.1"], "arm:"),
+        Mistake(["train", WORLD, f"--env-processes={rng.randrange(2, 99)}"], "env_processes:"),
+    ])  # fmt: skip
+
+
+def wrong_environment(rng: random.Random) -> Mistake:
+    known = ["HalfCheetah-v5", "Hopper-v5", "CartPole-v1", "InvertedPendulum-v5"]
+    name = rng.choice(known)
+    command = rng.choice(["train", "compare", "bench"])
+    return rng.choice([
+        Mistake([command, typo(name[:-3], rng) + name[-3:]], "env: unknown environment"),
+        Mistake(["train", f"nowhere{rng.randrange(99)}:Thing"], "env: cannot import"),
+        Mistake(["train", "worlds:Scriptd"], "did you mean 'Scripted'?"),
+        Mistake(["train", WORLD, "--env-kwargs", '{"speed": 3}'], "cannot be made"),
+        Mistake(["train", WORLD, "--env-kwargs", "{speed: 3}"], "env_kwargs: cannot read"),
+        Mistake(["train", "os:system"], "'os' is a part of Python"),
+        Mistake(["train"], "no environment given"),
+    ])  # fmt: skip
+
+
+def wrong_command(rng: random.Random) -> Mistake:
+    word = rng.choice([c for c in COMMANDS if len(c) > 4])
+    wrong = word
+    while wrong in COMMANDS:
+        wrong = typo(word, rng)
+    return Mistake([wrong, WORLD], f"invalid choice: '{wrong}'")
+
+
+def wrong_run(rng: random.Random) -> Mistake:
+    name = f"no-run-{rng.randrange(999)}"
+    return rng.choice([
+        Mistake(["resume", name], f"{name} is not a run directory"),
+        Mistake(["eval", name], f"{name} is not a run directory"),
+        Mistake(["resume", name, "--gamma", "0.9"], "unknown argument '--gamma'"),
+        Mistake(["eval", name, "--episodes", "0"], "episodes: must be a whole number"),
+        Mistake(["eval", name, "--seed", "x"], "seed: must be a whole number"),
+        Mistake(["resume", name, "--processes", "many"], f"{name} is not a run directory"),
+        Mistake(["train", "--config", f"{name}.json"], f"cannot read {name}.json"),
+    ])  # fmt: skip
+
+
+def wrong_config_file(rng: random.Random) -> Mistake:
+    name = rng.choice([n for n in FIELDS if len(n) > 4])
+    wrong = name
+    while wrong in FIELDS:
+        wrong = typo(name, rng)
+    return rng.choice([
+        Mistake(["train", WORLD, "--config", "{file}"], f"unknown key '{wrong}'; did you mean",
+                f'{{"{wrong}": 1}}'),
+        Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", '{"gamma": 0.9'),
+        Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", "[1, 2]"),
+        Mistake(["train", WORLD, "--config", "{file}"], "twice", '{"gamma": 0.9, "gamma": 0.5}'),
+        Mistake(["train", WORLD, "--config", "{file}"], "gamma: must be", '{"gamma": 2}'),
+    ])  # fmt: skip
+
+
+def wrong_study(rng: random.Random) -> Mistake:
+    start = 'tasks = ["worlds:Scripted"]\n'
+    arm = '[[arms]]\nlabel = "ppo"\n'
+    return rng.choice([
+        Mistake(["study", "fig33"], "did you mean"),
+        Mistake(["study", "{file}"], "cannot read", "tasks = ["),
+        Mistake(["study", "{file}"], "unknown key", f'task = ["x"]\n{arm}'),
+        Mistake(["study", "{file}"], "no arms", start),
+        Mistake(["study", "{file}"], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'),
+        Mistake(["study", "{file}"], "minibatches", f"minibatches = 7\n{start}{arm}"),
+        Mistake(["study", "{file}"], "gamma", f"gamma = {rng.uniform(1.1, 9):.3f}\n{start}{arm}"),
+        Mistake(["study", "{file}", "--processes", "-1"], "processes:", start + arm),
+        Mistake(["study", "{file}", "--on", "mars"], "invalid choice: 'mars'", start + arm),
+        Mistake(["compare", WORLD, "--arms", "ppo,ppo"], "twice"),
+        Mistake(["compare", WORLD, "--arms", "ppo,suana"], "did you mean 'sauna'?"),
+        Mistake(["compare", WORLD, "--gamma", "1.5"], "gamma"),
+        Mistake(["compare"], "no environment given"),
+        Mistake(["list", "arm"], "invalid choice: 'arm'"),
+        Mistake(["bench", "--rounds", "0"], "rounds: must be a whole number"),
+    ])  # fmt: skip
+
+
+KINDS: list[Callable[[random.Random], Mistake]] = [
+    wrong_flag, out_of_bounds, unreadable, unknown_choice, unknown_name, unread_setting,
+    impossible_together, wrong_environment, wrong_command, wrong_run, wrong_config_file,
+    wrong_study,
+]  # fmt: skip
+
+
+def experiment(least: int, seed: int, place: Path) -> Result:
+    """Mistakes of every kind, one in thirty in a process of its own. `worst`: CPU seconds."""
+    rng, tally, before = random.Random(seed), Tally(), os.getcwd()
+    folder = place / "folder"
+    try:
+        for number in range(least):
+            mistake = KINDS[number % len(KINDS)](rng)
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            file = place / "file.toml"
+            file.write_text(mistake.text)
+            arguments = [part.replace("{file}", str(file)) for part in mistake.arguments]
+            os.chdir(folder)
+            ask = _in_a_process if number % 30 == 29 else _here
+            _judge(arguments, mistake.said, ask, folder, tally)
+    finally:
+        os.chdir(before)
+    return tally.result()
+
+
+def _judge(
+    arguments: list[str], said: str, ask: Callable[..., tuple], folder: Path, tally: Tally
+) -> None:
+    code, errors, seconds = ask(arguments)
+    tally.tried += 1
+    tally.count("in a process of their own" if ask is _in_a_process else "in one process")
+    tally.took(seconds)
+    what = " ".join(arguments)
+    if code != 2 or said not in errors:
+        tally.miss(f"{what}: {code}, {errors[:300]!r} instead of {said!r}")
+    if not errors.startswith("sauna: ") or errors.count("\n") != 1:
+        tally.lose(f"{what}: not one line: {errors[:300]!r}")
+    if any(folder.iterdir()):
+        tally.lose(f"{what}: created {list(folder.iterdir())}")
+    if seconds >= SECONDS:
+        tally.lose(f"{what}: took {seconds:.2f} s of CPU")
+
+
+def _here(arguments: list[str]) -> tuple[int, str, float]:
+    errors, clock, code = io.StringIO(), time.process_time(), 0
+    with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            cli.main(arguments)
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return code, errors.getvalue(), time.process_time() - clock
+
+
+def _in_a_process(arguments: list[str]) -> tuple[int, str, float]:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-m", "sauna", *arguments], capture_output=True,
+                          text=True, env=environment())  # fmt: skip
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return done.returncode, done.stderr, seconds
+
+
+def test_mistakes_are_named_and_create_nothing(tmp_path: Path) -> None:
+    assert_held(experiment(96, 0, tmp_path), 96)
