@@ -130,6 +130,13 @@ def test_a_missing_backend_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> N
         make_jax_env("playground/CheetahRun", {})
 
 
+def test_a_backend_lists_its_environments(capsys: pytest.CaptureFixture[str]) -> None:
+    from sauna.cli import main
+
+    main(["list", "gymnax"])
+    assert "gymnax/CartPole-v1\n" in capsys.readouterr().out
+
+
 def test_unknown_names_and_arguments_are_bad_input() -> None:
     with pytest.raises(BadInput, match="CartPole-v1"):
         make_jax_env("gymnax/CartPole-v2", {})

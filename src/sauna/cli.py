@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config import FIELDS, FILTERS, TYPES, VEX_TARGETS, flag
+from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.errors import BadInput, Interrupted, SaunaError, nearest
 from sauna.presets import ARM_HELP, PRESET_HELP, given_by, parse_all
 
-LISTS = ("envs", "arms", "presets", "filters", "targets", "studies")
+LISTS = ("envs", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 # Fields that a comparison decides itself.
 _STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
@@ -312,9 +312,15 @@ def _list(values: dict[str, Any]) -> None:
         import gymnasium
 
         import sauna.envs.flagrun  # noqa: F401 - registers it
-        from sauna.envs.jax_native import installed
 
-        for name in [*sorted(gymnasium.registry), *installed()]:
+        for name in sorted(gymnasium.registry):
+            print(name)
+        for backend in NATIVE:
+            print(f"{backend}/...  (on the device; `sauna list {backend}` names them)")
+    elif what in NATIVE:
+        from sauna.envs.jax_native import names_of
+
+        for name in names_of(what):
             print(name)
     elif what == "studies":
         from sauna.study.spec import built_in

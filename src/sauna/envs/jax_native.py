@@ -32,8 +32,7 @@ def make_jax_env(env: str, env_kwargs: dict[str, Any]) -> JaxEnv:
     """
     backend, _, name = env.partition("/")
     if backend in NATIVE:
-        _check_installed(backend)
-        module = importlib.import_module(f"sauna.envs.{backend}_envs")
+        module = _module(backend)
         if name not in module.names():
             raise BadInput(f"env: unknown environment {env!r}{nearest(name, module.names())}")
         return _made(env, lambda: module.make(name, **env_kwargs))
@@ -50,14 +49,19 @@ def make_jax_env(env: str, env_kwargs: dict[str, Any]) -> JaxEnv:
     return thing
 
 
-def installed() -> list[str]:
-    """The names of all environments whose backend is installed."""
-    found: list[str] = []
-    for backend in NATIVE:
-        if _is_installed(backend):
-            module = importlib.import_module(f"sauna.envs.{backend}_envs")
-            found += [f"{backend}/{name}" for name in sorted(module.names())]
-    return found
+def names_of(backend: str) -> list[str]:
+    """All environments of a backend.
+
+    Raises:
+      BadInput: it is not installed.
+    """
+    return [f"{backend}/{name}" for name in sorted(_module(backend).names())]
+
+
+def _module(backend: str) -> Any:
+    if not _is_installed(backend):
+        raise BadInput(f"env: {backend} is not installed; `pip install 'sauna-rl[{backend}]'`")
+    return importlib.import_module(f"sauna.envs.{backend}_envs")
 
 
 def _known() -> str:
@@ -78,8 +82,3 @@ def _is_installed(backend: str) -> bool:
         return importlib.util.find_spec(PACKAGES[backend]) is not None
     except ModuleNotFoundError:  # of a parent package
         return False
-
-
-def _check_installed(backend: str) -> None:
-    if not _is_installed(backend):
-        raise BadInput(f"env: {backend} is not installed; `pip install 'sauna-rl[{backend}]'`")
