@@ -23,7 +23,17 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 RESULTS = ROOT / "results" / "mutants.json"
-QUICK = ("advantages", "losses", "filters", "vex", "networks", "collect", "reference", "properties")
+QUICK = (
+    "advantages",
+    "batch",
+    "losses",
+    "filters",
+    "vex",
+    "networks",
+    "collect",
+    "reference",
+    "properties",
+)
 SLOW = ("probes", "population")  # for what the others let pass
 
 
@@ -50,7 +60,7 @@ MUTANTS = [
         ("no gamma in the sum", "gamma * gae_lambda * goes_on_t", "gae_lambda * goes_on_t"),
         ("forwards in time", "reverse=True", "reverse=False"),
     ),
-    *_of("core/batch.py", "advantages reference vex",
+    *_of("core/batch.py", "advantages batch reference vex",
         ("dropped steps are kept", "jnp.argsort(~keep", "jnp.argsort(keep"),
         ("stream goes on at its end", "zeros_like(rollout.valid[:1])])\n    bootstrap",
          "ones_like(rollout.valid[:1])])\n    bootstrap"),
@@ -73,7 +83,7 @@ MUTANTS = [
         ("log-probabilities of other steps", "take(rollout.log_prob, rows)",
          "take(rollout.log_prob, rows[::-1])"),
     ),
-    *_of("core/losses.py", "losses",
+    *_of("core/losses.py", "losses batch",
         ("mean over empty slots, too", "jnp.maximum(jnp.sum(weight), 1.0)", "weight.shape[0]"),
         ("advantages not centred", "centred = advantage - weighted_mean(advantage, weight)",
          "centred = advantage"),
@@ -106,7 +116,7 @@ MUTANTS = [
         ("batch variance weighted by count", "batch_variance * fraction, total",
          "batch_variance * (1 - fraction), total"),
     ),
-    *_of("core/update.py", "losses faults/test_07_poisoned_batch",
+    *_of("core/update.py", "losses batch faults/test_07_poisoned_batch",
         ("uphill", "state.params - hypers.learning_rate * step",
          "state.params + hypers.learning_rate * step"),
         ("element-wise clipping", "optax.clip_by_global_norm(hypers.max_grad_norm)",
@@ -119,7 +129,7 @@ MUTANTS = [
         ("median off by one", "ordered[(number - 1) // 2]", "ordered[number // 2]"),
         ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
     ),
-    *_of("core/policy.py", "networks reference",
+    *_of("core/policy.py", "networks",
         ("value and Vex swapped", "[log_prob, output.value, output.vex]",
          "[log_prob, output.vex, output.value]"),
         ("acts without noise", "policy.apply(params, observation).policy, noise)",
@@ -145,7 +155,7 @@ MUTANTS = [
          '"tanh": nn.tanh, "relu": nn.relu', '"tanh": nn.relu, "relu": nn.tanh'),
         ("pixels not scaled", "x.astype(jnp.float32) / 255.0", "x.astype(jnp.float32)"),
     ),
-    *_of("core/population.py", "losses collect reference population",
+    *_of("core/population.py", "batch losses",
         ("noise repeats in a rollout",
          "jax.random.fold_in(jax.random.fold_in(root, iteration), block)",
          "jax.random.fold_in(root, iteration)"),
@@ -156,7 +166,7 @@ MUTANTS = [
          "np.tile(samples, (config.epochs, 1))"),
         ("one key for all members", "jax.random.key(seed)", "jax.random.key(0)"),
     ),
-    *_of("selection/filters.py", "filters reference",
+    *_of("selection/filters.py", "filters batch reference",
         ("median off by one", "jnp.maximum(history.number - 1, 0) // 2", "history.number // 2"),
         ("history does not grow",
          "History(ordered, history.number + 1)", "History(ordered, history.number)"),
@@ -172,7 +182,7 @@ MUTANTS = [
          "jax.random.fold_in(key, first + t)", "jax.random.fold_in(key, t)"),
         ("one step too many", "carry[0] < length", "carry[0] <= length"),
     ),
-    *_of("selection/vex.py", "vex",
+    *_of("selection/vex.py", "vex batch",
         ("unexplained instead of explained", "jnp.where(varies, 1.0 - unexplained /",
          "jnp.where(varies, unexplained /"),
         ("constant returns are explained", "jnp.where(varies, variance, 1.0), 0.0)",
