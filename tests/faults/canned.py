@@ -42,7 +42,7 @@ def serve(recorder: Recorder, inbox: Connection, outlet: Connection) -> None:
         if start and not equal(arrays, recorder.states[start]):
             raise AssertionError("the worker was given another state than was saved")
         reporter, iteration = PipeReporter(inbox, outbox, dies_alone=False), start
-        while iteration < ITERATIONS and reporter.may_start(iteration):
+        while iteration < ITERATIONS and reporter.allowance(iteration):
             timing = {"seconds": 1.0, "collect_seconds": 0.5, "env_steps": 32}
             reporter.iteration(iteration, [recorder.rows[iteration]], timing)
             iteration += 1

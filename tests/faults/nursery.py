@@ -195,11 +195,11 @@ def _fork_worker(module: str, environment: dict[str, str]) -> Any:
     return Worker(_ForkedWorker(pid), *ends)  # type: ignore[arg-type]
 
 
-def _cache_everything(configure: Callable[[], None]) -> None:
+def _cache_everything(configure: Callable[..., None], *where: Any) -> None:
     """Also the small programs are read from the cache on disk: the same ones, sooner."""
     import jax
 
-    configure()
+    configure(*where)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
