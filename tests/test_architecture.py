@@ -16,7 +16,7 @@ ALLOWED = {
     "envs": {"compiled", "spaces", "wire"},
     "collect": {"compiled", "core", "envs.contract", "envs.jax_env", "selection", "spaces"},
     "metrics": {"presets", "rundir", "collect", "core", "member_state", "style"},
-    "study": {"presets", "rundir", "run", "style", "envs.probe", "metrics.display"},
+    "study": {"placement", "presets", "rundir", "run", "style", "envs.probe", "metrics.display"},
     "bench": {
         "checkpoint",
         "collect",
@@ -25,6 +25,7 @@ ALLOWED = {
         "device_training",
         "envs",
         "member_state",
+        "placement",
         "metrics.rows",
         "presets",
         "run",
