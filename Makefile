@@ -35,7 +35,7 @@ demo: .venv/.run
 	$(BIN)/sauna train InvertedPendulum-v5 --arm sauna --seeds 3 --steps 100000
 
 test: .venv/.dev
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
 
 test-slow: .venv/.cluster
 	$(BIN)/python -m pytest -m slow

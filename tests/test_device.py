@@ -51,14 +51,21 @@ class SteppedHere(HostEnvs):
         )
 
 
-ARMS: list[tuple[str, dict[str, Any]]] = [
-    ("ppo", {}),
+slow = pytest.mark.slow
+ARMS = [
+    pytest.param("ppo", {}, marks=slow),
     ("sauna", {"threshold": 0.9}),
     ("sauna", {"threshold": 0.9, "dropped": "mask"}),
-    ("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}),
-    ("sauna", {"threshold": 0.9, "reset": "cached", "normalize_rewards": False}),
-    ("random-drop", {"drop_rate": 0.4, "truncation": "terminate"}),
-    ("sauna", {"threshold": 0.9, "max_env_steps_factor": 1, "normalize_observations": False}),
+    pytest.param("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}, marks=slow),
+    pytest.param(
+        "sauna", {"threshold": 0.9, "reset": "cached", "normalize_rewards": False}, marks=slow
+    ),
+    pytest.param("random-drop", {"drop_rate": 0.4, "truncation": "terminate"}, marks=slow),
+    pytest.param(
+        "sauna",
+        {"threshold": 0.9, "max_env_steps_factor": 1, "normalize_observations": False},
+        marks=slow,
+    ),
 ]
 
 
@@ -172,7 +179,7 @@ def test_results_do_not_depend_on_how_many_iterations_a_call_runs() -> None:
     assert len(whole.rows) < MOST_PER_CALL
 
 
-@pytest.mark.parametrize("reset", ["fresh", "cached"])
+@pytest.mark.parametrize("reset", ["fresh", pytest.param("cached", marks=slow)])
 def test_resume_is_exact(reset: str) -> None:
     whole = train_here(device_job(reset=reset))
     first = train_here(device_job(reset=reset), stop=2)
@@ -181,6 +188,7 @@ def test_resume_is_exact(reset: str) -> None:
     assert whole.rows == first.rows + rest.rows
 
 
+@slow
 def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted() -> None:
     job = make_job("jax_worlds:walk", arm="sauna", envs=3, steps=1000, seeds=2, threshold=0.9)
     rows = train_here(job).rows
@@ -252,6 +260,7 @@ def test_bad_input_is_refused(
         run.start({**SMALL, **settings}, PlainDisplay())
 
 
+@slow
 def test_the_environment_of_the_docs_trains(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (Path(__file__).parent.parent / "docs" / "device.md").read_text()
     (tmp_path / "my_envs.py").write_text(text.split("```python\n")[1].split("```")[0])

@@ -31,7 +31,7 @@ BACKENDS = [
     ("jax_worlds:make_walk", {"limit": 1e9}, 12),
     ("gymnax/Pendulum-v1", {"max_steps_in_episode": 7}, 7),
     ("gymnax/Breakout-MinAtar", {"max_steps_in_episode": 7}, 7),
-    ("mjx/InvertedPendulum-v5", {"time_limit": 4}, 4),
+    pytest.param("mjx/InvertedPendulum-v5", {"time_limit": 4}, 4, marks=slow),
     pytest.param("playground/CheetahRun", {"episode_length": 3}, 3, marks=slow),
     pytest.param("brax/inverted_pendulum", {"episode_length": 4}, 4, marks=slow),
     pytest.param("mjx/HalfCheetah-v5", {"time_limit": 3}, 3, marks=slow),
@@ -165,7 +165,7 @@ class UntilSolved(Recorder):
         return 0 if min(self.best.values()) > 475 else 16
 
 
-@pytest.mark.parametrize("arm", ["ppo", "sauna"])
+@pytest.mark.parametrize("arm", [pytest.param("ppo", marks=slow), "sauna"])
 def test_ten_members_solve_cartpole(arm: str) -> None:
     """As Gymnasium defines it: 475 on average over 100 episodes; every member, within 2e5 steps."""
     recorder = UntilSolved()
