@@ -200,6 +200,7 @@ def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted() -> None:
         assert mine[-1]["kept_steps"] < mine[-1]["env_steps"]
 
 
+@pytest.mark.slow
 def test_the_learning_rate_falls_and_a_drop_rate_follows_its_list() -> None:
     job = make_job("jax_worlds:walk", arm="ppo", learning_rate=0.5)
     rows = train_here(job).rows
@@ -210,6 +211,7 @@ def test_the_learning_rate_falls_and_a_drop_rate_follows_its_list() -> None:
     assert max(row["keep_rate"] for row in rows[1:]) < 0.4
 
 
+@pytest.mark.slow
 def test_a_truncated_episode_bootstraps_and_a_wrong_one_would_not() -> None:
     """With a time limit every other step the value is still 1 / (1 - gamma) = 2."""
     settings = {"rollout_steps": 64, "minibatches": 2, "epochs": 4, "steps": 64 * 120,
@@ -228,6 +230,7 @@ def test_a_truncated_episode_bootstraps_and_a_wrong_one_would_not() -> None:
     assert found["terminate"] < 1.6  # 1 or 1.5, as the episode has one or two steps to go
 
 
+@pytest.mark.slow
 def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
     job = make_job("jax_worlds:broken", arm="ppo", envs=2)
     with pytest.raises(EnvironmentFailure, match=r"environment 0 .* step 4 .* reward"):

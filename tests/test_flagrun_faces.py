@@ -240,6 +240,7 @@ def host_at(state: Any) -> HumanoidFlagrunHarder:
     return env
 
 
+@pytest.mark.slow
 def test_a_reset_on_the_device_is_the_hosts() -> None:
     env = device_env()
     key = jax.random.key(3)

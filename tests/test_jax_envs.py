@@ -85,6 +85,7 @@ def equal_trees(one: Any, other: Any) -> bool:
         pytest.param("Hopper-v5", 2e-2, marks=slow),
     ],
 )
+@pytest.mark.slow
 def test_mjx_tasks_are_gymnasiums_to_single_precision(name: str, tolerance: float) -> None:
     """From the same state, with the same actions: observations, rewards and ends of 8 steps."""
     ours, theirs = make_jax_env(f"mjx/{name}", {}), gymnasium.make(name)
@@ -165,7 +166,8 @@ class UntilSolved(Recorder):
         return 0 if min(self.best.values()) > 475 else 16
 
 
-@pytest.mark.parametrize("arm", [pytest.param("ppo", marks=slow), "sauna"])
+@pytest.mark.parametrize("arm", ["ppo", "sauna"])
+@pytest.mark.slow
 def test_ten_members_solve_cartpole(arm: str) -> None:
     """As Gymnasium defines it: 475 on average over 100 episodes; every member, within 2e5 steps."""
     recorder = UntilSolved()
@@ -174,6 +176,7 @@ def test_ten_members_solve_cartpole(arm: str) -> None:
 
 
 @pytest.mark.parametrize("env", ["playground/CheetahRun", "sauna/HumanoidFlagrunHarder-v0"])
+@pytest.mark.slow
 def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path) -> None:
     """As a user would; XLA is told not to optimise, which would take longer than the training."""
     run = tmp_path / "run"

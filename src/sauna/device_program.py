@@ -177,13 +177,16 @@ def several(
     """Iterations `first` to `first + number`, at most `MOST_PER_CALL`.
 
     How many is traced: one program serves every number, so results do not depend on it. It ends
-    early once some number is not finite, with that iteration's report as the last that ran.
+    early once some number is not finite, with that iteration's report as the last that ran, or
+    when no member's budget holds a further rollout.
 
     Returns:
       the state, and reports with a leading axis `[MOST_PER_CALL]`, `ran` False where none is.
     """
     shapes = jax.eval_shape(iterate, state, setting, first)[1]
     empty = jax.tree.map(lambda x: jnp.zeros((MOST_PER_CALL, *x.shape), x.dtype), shapes)
+
+    number = jnp.minimum(number, MOST_PER_CALL)
 
     def goes_on(now: tuple[Array, Any, Report, Array]) -> Array:
         return (now[0] < number) & now[3]
@@ -192,7 +195,7 @@ def several(
         i, state, reports, _ = now
         state, report = iterate(state, setting, first + i)
         reports = jax.tree.map(lambda all, x: all.at[i].set(x), reports, report)
-        return i + 1, state, reports, jnp.all(is_sound(report))
+        return i + 1, state, reports, jnp.all(is_sound(report)) & jnp.any(report.ran)
 
     _, state, reports, _ = jax.lax.while_loop(
         goes_on, step, (jnp.int32(0), state, empty, jnp.bool_(True))

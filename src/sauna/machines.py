@@ -43,10 +43,12 @@ def read_place(text: str) -> Place:
 
 
 def join(place: Place) -> None:
-    """Waits until all machines are there. Before anything else is asked of JAX."""
+    """Waits until all machines are there, once. Before anything else is asked of JAX."""
     if place.machines > 1:
         import jax
 
+        if jax.distributed.is_initialized():
+            return
         jax.distributed.initialize(place.address, place.machines, place.number)
 
 

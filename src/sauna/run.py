@@ -19,7 +19,7 @@ from sauna.config import ON_DEVICE, Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe
 from sauna.errors import BadInput, SaunaError, one_line
-from sauna.machines import Follower, read_place
+from sauna.machines import Follower, join, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.placement import look_at, placed
@@ -135,6 +135,7 @@ def follow(given: Mapping[str, Any], display: Display) -> None:
     given = plain(given)
     config = placed(resolve(given))
     configure_jax(config.devices if config.device == "cpu" else 0, config.device)
+    join(read_place(config.distributed))  # before an environment makes its first array
     found = look_at(config)
     config = settle(config, found.spaces)
     check_read_after_settling(found.spaces, config, given)

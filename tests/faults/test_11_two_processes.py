@@ -8,6 +8,8 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
+
 from faults.chain import Chain, Stage, children, orphans, send, train_arguments
 from faults.nursery import Nursery, Process
 from faults.result import Result, Tally, assert_held
@@ -79,5 +81,6 @@ def _check_told(loser: Process, winner: Process, what: str, tally: Tally) -> Non
         tally.miss(f"{what}: a loser said {said[-300:]!r}, the winner was {winner.pid}")
 
 
+@pytest.mark.slow
 def test_one_gets_the_run_and_the_others_are_told(stage: Stage, tmp_path: Path) -> None:
     assert_held(_race_again_and_again(stage, 3, 6, tmp_path), 3)

@@ -25,6 +25,7 @@ from sauna.presets import members, resolve
 from sauna.run import plain, settle
 from sauna.worker import configure_jax
 
+MOST_STEPS = 2**31 - 1  # that the device counts to
 # Numbers of environments that `--scale` tries, and of members.
 ENVS = {"cpu": (8, 32, 128), "gpu": (256, 512, 1024, 2048, 4096, 8192, 16384)}
 MEMBERS = {"cpu": (1, 4, 16), "gpu": (1, 4, 16, 64)}
@@ -89,10 +90,10 @@ _APART = ("compile_seconds", "peak_memory_mib")  # of a round, and not a rate
 
 
 def _given(given: Mapping[str, Any], iterations: int) -> dict[str, Any]:
-    given = plain({"backend": "device", **given})
-    config = resolve(given)
+    given = {**plain({"backend": "device", **given}), "processes": 1}
+    config = resolve({**given, "steps": MOST_STEPS})  # room for a rollout of any size
     steps = config.rollout_steps * config.envs * iterations
-    return {**given, "steps": min(steps, 2**31 - 1), "processes": 1}
+    return {**given, "steps": min(steps, MOST_STEPS // config.max_env_steps_factor)}
 
 
 def _told(round_: Mapping[str, float], name: str) -> str:
@@ -170,16 +171,25 @@ def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
     population = make_population(job)
     compile_seconds = population.compile()
     population.run(0, 1)
-    clock = time.perf_counter()
-    reports = population.run(1, iterations)
-    seconds = time.perf_counter() - clock
-    steps = sum(int(report.env_steps[report.ran].sum()) for report in reports)
-    rates = {"whole": steps / seconds}
+    rates = {"whole": _whole(population, iterations)}
     for name, rate in _parts(population, config, iterations).items():
         rates[name] = rate
     device = jax.devices()[0]
     memory = (device.memory_stats() or {}).get("peak_bytes_in_use", 0)
     return {**rates, "compile_seconds": compile_seconds, "peak_memory_mib": memory / 2**20}
+
+
+def _whole(population: Any, iterations: int) -> float:
+    """Env steps per second of that many whole iterations, a device's call of them at a time."""
+    from sauna.device_program import MOST_PER_CALL
+
+    first, steps, clock = 1, 0, time.perf_counter()
+    while first <= iterations:
+        number = min(MOST_PER_CALL, iterations + 1 - first)
+        reports = population.run(first, number)
+        steps += sum(int(report.env_steps[report.ran].sum()) for report in reports)
+        first += number
+    return steps / (time.perf_counter() - clock)
 
 
 def _parts(population: Any, config: Config, iterations: int) -> dict[str, float]:

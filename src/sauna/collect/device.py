@@ -151,23 +151,28 @@ def collect(
     if room == config.rollout_steps:  # every env acts in every row: a plain scan
         carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=room)
     else:
-        carry, rows = _until_full(step, carry, room, limit, config.rollout_steps)
+        carry, rows = _until_full(parts, step, carry, room, limit)
     return _finish(parts, params, carry.state, rows, hypers)
 
 
 def _until_full(
+    parts: Collecting,
     step: Callable[[_Carry], tuple[_Carry, _Row]],
     carry: _Carry,
     room: int,
     limit: Array,
-    wanted: int,
 ) -> tuple[_Carry, _Row]:
-    """`step` until all environments are full or `limit` rows are written; the rest stays 0."""
+    """`step` until all environments are full or `limit` rows are written; the rest stays 0.
+
+    Members that are compiled together go on until the last of them is full: a condition of each
+    member's own would copy all rows in every step.
+    """
+    wanted = parts.config.rollout_steps
     shapes = jax.eval_shape(step, carry)[1]
     empty = jax.tree.map(lambda row: jnp.zeros((room, *row.shape), row.dtype), shapes)
 
     def goes_on(now: tuple[_Carry, _Row]) -> Array:
-        return jnp.any(now[0].kept < wanted) & (now[0].t < limit)
+        return parts.anywhere(jnp.any(now[0].kept < wanted) & (now[0].t < limit))
 
     def write(now: tuple[_Carry, _Row]) -> tuple[_Carry, _Row]:
         carry, row = step(now[0])

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sauna.envs.jax_env import JaxEnv, Transition
+from sauna.envs.jax_env import JaxEnv, Transition, ended_where_broken
 from sauna.errors import BadInput
 
 
@@ -44,24 +44,27 @@ def from_brax(
     if not isinstance(size, int) and "state" not in size:
         raise BadInput(f"env: observations {sorted(size)} are not supported; one named 'state' is")
     shape = (size,) if isinstance(size, int) else tuple(np.atleast_1d(size["state"]))
-    limit = episode_length // action_repeat
+    limit = -(-episode_length // action_repeat)
 
     def seen(state: Any) -> jax.Array:
         return state.obs if isinstance(size, int) else state.obs["state"]
 
     def reset(key: jax.Array) -> tuple[State, jax.Array]:
-        inner = env.reset(key)
+        with jax.default_matmul_precision("highest"):
+            inner = env.reset(key)
         return State(inner, jnp.int32(0)), seen(inner)
 
     def step(state: State, action: jax.Array) -> Transition:
         inner, reward = state.inner, jnp.float32(0.0)
-        for _ in range(action_repeat):
-            inner = env.step(inner, action)
-            reward += inner.reward
-        terminated = inner.done > 0
+        with jax.default_matmul_precision("highest"):
+            for _ in range(action_repeat):
+                inner = env.step(inner, action)
+                reward += inner.reward
         steps = state.steps + 1
-        truncated = (steps >= limit) & ~terminated
-        return Transition(State(inner, steps), seen(inner), reward, terminated, truncated)
+        told = Transition(
+            State(inner, steps), seen(inner), reward, inner.done > 0, jnp.asarray(steps >= limit)
+        )
+        return ended_where_broken(told)
 
     unbounded = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
     actions = gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)

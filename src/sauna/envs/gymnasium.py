@@ -55,6 +55,7 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
         except Exception as error:
             raise BadInput(f"env: cannot import {module!r}: {one_line(error)}") from error
     if name.startswith("sauna/"):
+        _tame_mujoco()
         importlib.import_module("sauna.envs.flagrun")
     if name not in gymnasium.registry:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")

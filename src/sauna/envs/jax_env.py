@@ -51,6 +51,21 @@ class JaxEnv(NamedTuple):
     frames_per_second: float = 30.0
 
 
+def ended_where_broken(told: Transition) -> Transition:
+    """A simulation whose numbers are not finite any more ends its episode, with zeros to see.
+
+    For physics alone, where that is a known end; other environments are told of as faulty.
+    """
+    sound = jnp.all(jnp.isfinite(told.observation)) & jnp.isfinite(told.reward)
+    terminated = told.terminated | ~sound
+    return told._replace(
+        observation=jnp.where(sound, told.observation, 0.0),
+        reward=jnp.where(sound, told.reward, 0.0),
+        terminated=terminated,
+        truncated=told.truncated & ~terminated,
+    )
+
+
 class Running(NamedTuple):
     """N environments in the middle of their episodes."""
 
@@ -154,11 +169,25 @@ def advance(
     def fresh() -> tuple[State, Array]:
         return jax.vmap(env.reset)(_episode_keys(key, episode))
 
-    start = running.first or jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
+    if running.first:
+        start = _with_new_keys(running.first, episode)
+    else:
+        start = jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
     now = (running.state, running.observation)
     state, observation = _where(acting, _where(ended, start, reached), now)
     told = transition._replace(terminated=terminated, truncated=truncated)
     return Running(state, observation, episode, running.first), told
+
+
+def _with_new_keys(first: Any, episode: Array) -> Any:
+    """A cached start whose random keys are this episode's own: only the start is repeated."""
+
+    def renew(leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return leaf
+        return jax.vmap(jax.random.fold_in)(leaf, episode)
+
+    return jax.tree.map(renew, first)
 
 
 def _where(mask: Array, yes: Any, no: Any) -> Any:

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from sauna.envs.jax_env import JaxEnv, Transition
+from sauna.envs.jax_env import JaxEnv, Transition, ended_where_broken
 
 
 class MjxTask(NamedTuple):
@@ -87,15 +87,15 @@ def on_mjx(task: MjxTask, impl: str = "jax") -> JaxEnv:
             after = jax.lax.fori_loop(
                 0, task.frame_skip, lambda _, data: mjx.step(model, data), before
             )
-            terminated = task.terminated(after)
             steps = state.steps + 1
-            return Transition(
+            told = Transition(
                 state_of(after, steps),
                 task.observe(after),
                 task.reward(before, after, action),
-                terminated,
-                (steps >= task.time_limit) & ~terminated,
+                task.terminated(after),
+                steps >= task.time_limit,
             )
+            return ended_where_broken(told)
 
     low, high = task.model.actuator_ctrlrange.T.astype(np.float32)
     size = jax.eval_shape(lambda key: reset(key)[1], jax.random.key(0)).shape
