@@ -17,8 +17,8 @@ from helpers import SMALL, environment
 from sauna import rundir
 from sauna.api import compare
 from sauna.errors import BadInput
-from sauna.presets import ARMS
-from sauna.study.command import COMPARED, comparison
+from sauna.presets import ARMS, COMPARED
+from sauna.study.command import comparison
 from sauna.study.process import UnitProcess
 from sauna.study.spec import built_in, check, load_spec, read_spec
 from sauna.study.summary import summarize

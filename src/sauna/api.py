@@ -11,6 +11,7 @@ from sauna import run as runs
 from sauna.errors import BadInput
 from sauna.metrics.display import Display, PlainDisplay, make_display
 from sauna.names import name_of
+from sauna.presets import COMPARED, parse_all
 
 PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
 
@@ -71,7 +72,7 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
 def compare(
     env: Any,
     *,
-    arms: Sequence[str] = ("ppo", "vex-head", "random-drop", "sauna"),
+    arms: Sequence[str] = COMPARED,
     out: str | Path = "runs",
     processes: int = 0,
     quiet: bool = False,
@@ -95,7 +96,6 @@ def compare(
     Raises:
       BadInput: something is not usable; nothing was created.
     """
-    from sauna.presets import parse_all
     from sauna.study.command import compare_command, comparison, study
 
     given = {"env": name_of(env), **settings}

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from sauna import __version__
 from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.errors import BadInput, Interrupted, SaunaError, nearest
-from sauna.presets import ARM_HELP, PRESET_HELP, given_by, parse_all
+from sauna.presets import ARM_HELP, COMPARED, PRESET_HELP, given_by, parse_all
 
 LISTS = ("envs", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 # Fields that a comparison decides itself.
@@ -62,8 +62,9 @@ def make_parser() -> argparse.ArgumentParser:
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, allow_abbrev=False)
     compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
-    text = "what to compare; the first is the baseline (default ppo,vex-head,random-drop,sauna)"
-    compare.add_argument("--arms", default="ppo,vex-head,random-drop,sauna", help=text)
+    arms = ",".join(COMPARED)
+    text = f"what to compare; the first is the baseline (default {arms})"
+    compare.add_argument("--arms", default=arms, help=text)
     _add_fields(compare, [n for n in FIELDS if n not in _STUDYS])
 
     study = commands.add_parser("study", help="run a study of the paper's, or your own",

@@ -14,6 +14,8 @@ from sauna.errors import BadInput
 from sauna.machines import read_place
 from sauna.worker import configure_jax
 
+MOST_STEPS = 2**31 - 1  # that the device's counters hold
+
 
 def placed(config: Config) -> Config:
     """Resolves where the environments run, and on what.
@@ -30,8 +32,8 @@ def placed(config: Config) -> Config:
     if read_place(config.distributed).machines > 1 and config.devices:
         raise BadInput("devices: not read with distributed, where every device takes part")
     most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
-    if most >= 2**31:
-        raise BadInput(f"steps: the device counts to {2**31 - 1}, not to {most}")
+    if most > MOST_STEPS:
+        raise BadInput(f"steps: the device counts to {MOST_STEPS}, not to {most}")
     device = config.device
     if device == "gpu" and not has_gpu():
         raise BadInput("device: no NVIDIA GPU here that JAX can use; "

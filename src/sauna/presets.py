@@ -58,6 +58,9 @@ ARM_HELP = {
     "sauna-reference": "the method as the authors' released code does it, quirks included",
 }
 
+# The arms of a comparison where none are named; the first is the baseline.
+COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+
 # What makes an arm what its name says; the user's own values do not apply to these.
 FIXED: dict[str, tuple[str, ...]] = {
     "ppo": ("filter", "vex_coef"),

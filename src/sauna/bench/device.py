@@ -20,12 +20,11 @@ from sauna import rundir
 from sauna.bench.rates import ratio
 from sauna.config import Config
 from sauna.errors import BadInput, SaunaError
-from sauna.placement import look_at, placed
+from sauna.placement import MOST_STEPS, look_at, placed
 from sauna.presets import members, resolve
 from sauna.run import plain, settle
 from sauna.worker import configure_jax
 
-MOST_STEPS = 2**31 - 1  # that the device counts to
 # Numbers of environments that `--scale` tries, and of members.
 ENVS = {"cpu": (8, 32, 128), "gpu": (256, 512, 1024, 2048, 4096, 8192, 16384)}
 MEMBERS = {"cpu": (1, 4, 16), "gpu": (1, 4, 16, 64)}
@@ -171,9 +170,7 @@ def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
     population = make_population(job)
     compile_seconds = population.compile()
     population.run(0, 1)
-    rates = {"whole": _whole(population, iterations)}
-    for name, rate in _parts(population, config, iterations).items():
-        rates[name] = rate
+    rates = {"whole": _whole(population, iterations), **_parts(population, config, iterations)}
     device = jax.devices()[0]
     memory = (device.memory_stats() or {}).get("peak_bytes_in_use", 0)
     return {**rates, "compile_seconds": compile_seconds, "peak_memory_mib": memory / 2**20}

@@ -24,7 +24,6 @@ from sauna.study.summary import summarize
 from sauna.study.units import Unit, most_seeds, seeds_per_unit, units_of
 from sauna.study.view import StudyView
 
-COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
 SEEDS = 6  # of a comparison, where none are given
 
 
@@ -240,4 +239,4 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-__all__ = ["COMPARED", "comparison", "cores", "lines", "load_spec", "study", "write"]
+__all__ = ["comparison", "cores", "lines", "load_spec", "study", "write"]
