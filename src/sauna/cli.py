@@ -20,7 +20,7 @@ from sauna.presets import ARM_HELP, COMPARED, PRESET_HELP, given_by, parse_all
 
 LISTS = ("envs", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 # Fields that a comparison decides itself.
-_STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard")
+_STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
 
 

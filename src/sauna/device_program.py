@@ -26,6 +26,7 @@ from sauna.core.population import Keys
 from sauna.core.types import Array, Hypers, Rollout, TrainState
 from sauna.core.update import UpdateMetrics, init_state, learn
 from sauna.envs.jax_env import JaxEnv
+from sauna.machines import shared_over
 from sauna.selection.filters import make_filter
 from sauna.selection.vex import VexTarget, make_target
 from sauna.spaces import Spaces
@@ -227,6 +228,7 @@ class Population:
         mesh: Mesh | None = None,
     ) -> None:
         self.number, self._mesh = len(settings), mesh
+        self.devices = 1 if mesh is None else mesh.size  # that share the members
         self._one_by_one = mesh is None and jax.default_backend() == "cpu"
         together = not self._one_by_one
 
@@ -320,15 +322,11 @@ def make_mesh(members: int, envs: int, devices: list[Any]) -> Mesh | None:
     None with one device. Devices that neither members nor environments can be shared over evenly
     are left out.
     """
-    best = max(
-        (a * b, a, b)
-        for a in range(1, len(devices) + 1)
-        for b in range(1, len(devices) // a + 1)
-        if members % a == 0 and envs % b == 0
-    )
-    if best[0] == 1:
+    over_members, over_envs = shared_over(members, envs, len(devices))
+    used = over_members * over_envs
+    if used == 1:
         return None
-    return Mesh(np.array(devices[: best[0]]).reshape(best[1], best[2]), (MEMBERS, ENVS))
+    return Mesh(np.array(devices[:used]).reshape(over_members, over_envs), (MEMBERS, ENVS))
 
 
 def shardings(mesh: Mesh, states: MemberState) -> Any:

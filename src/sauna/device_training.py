@@ -7,6 +7,7 @@ is due.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna.collect.collected import Collected, Episode
-from sauna.config import Config
+from sauna.config import Config, to_json
 from sauna.core.normalize import Moments
 from sauna.core.policy import Policy
 from sauna.core.population import member_keys
@@ -34,13 +35,17 @@ from sauna.envs.gymnasium import EnvironmentFailure
 from sauna.envs.jax_env import flat
 from sauna.envs.jax_native import make_jax_env
 from sauna.errors import BadInput
-from sauna.machines import join, read_place, share, tell
+from sauna.machines import check_shared, join, read_place, same, share, tell
 from sauna.member_state import Counters, fitting, flat_params, named_params, under, unpack_adam
 from sauna.metrics.rows import metrics_row
 from sauna.presets import Member
+from sauna.rundir import versions
 from sauna.training import Job, Reporter, check_finite, goes_on
 
 Arrays = dict[str, np.ndarray]
+# What machines that train together may have each in their own way.
+OF_A_MACHINE = ("distributed", "out", "processes", "keep_checkpoints", "tensorboard",
+                "drop_rate_from")  # fmt: skip
 
 
 def train_on_device(job: Job, reporter: Reporter) -> None:
@@ -54,7 +59,12 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     config = job.config
     place = read_place(config.distributed)
     join(place)
+    if not same(place, _settings(job)):
+        raise BadInput("distributed: the machines have different settings or versions; give each "
+                       "the same command but for its index")  # fmt: skip
     population = make_population(job)
+    if config.device == "gpu":
+        reporter.phase(f"on {population.devices} of {len(jax.devices())} GPUs")
     counters = [Counters() for _ in job.members]
     restored = share(place, dict(job.restored or {}))
     if restored:
@@ -76,6 +86,13 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     reporter.state(iteration, pack(job, population, counters))
 
 
+def _settings(job: Job) -> str:
+    """What must be alike on machines that train together."""
+    own = dict.fromkeys(OF_A_MACHINE, "")
+    members = [{**to_json(member.config), **own} for member in job.members]
+    return json.dumps([{**to_json(job.config), **own}, members, job.drop_rates, versions()])
+
+
 def make_population(job: Job) -> Population:
     """The job's members at the start of their training."""
     config = job.config
@@ -89,11 +106,8 @@ def make_population(job: Job) -> Population:
     ]
     devices = _devices(config)
     mesh = make_mesh(len(settings), config.envs, devices)
-    if config.distributed and (mesh is None or mesh.size < len(devices)):
-        raise BadInput(
-            f"distributed: {len(settings)} members of {config.envs} environments cannot be shared "
-            f"evenly over {len(devices)} devices"
-        )
+    if config.distributed:
+        check_shared("distributed", len(settings), config.envs, len(devices))
     return Population(config, job.spaces, env, settings, mesh)
 
 
@@ -101,9 +115,11 @@ def _devices(config: Config) -> list[Any]:
     """Those that share the population: of all machines.
 
     Raises:
-      BadInput: there are fewer than asked for.
+      BadInput: there are fewer than asked for, or of another kind.
     """
     found, wanted = jax.devices(), config.devices
+    if found[0].platform != config.device:
+        raise BadInput(f"device: JAX uses the {found[0].platform} here, not the {config.device}")
     if wanted > len(found):
         raise BadInput(f"devices: {wanted} asked for, {len(found)} are there")
     return found[:wanted] if wanted else found

@@ -6,6 +6,7 @@ Machine 0 alone writes the run and decides how far it goes; the others are told,
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,16 @@ def tell(place: Place, number: int) -> int:
     return int(broadcast_one_to_all(np.int32(number)))
 
 
+def same(place: Place, text: str) -> bool:
+    """Whether all machines say the same."""
+    if place.machines == 1:
+        return True
+    from jax.experimental.multihost_utils import process_allgather
+
+    own = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
+    return bool((np.asarray(process_allgather(own)) == own).all())
+
+
 def share(place: Place, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Machine 0's arrays, on every machine."""
     if place.machines == 1:
@@ -72,6 +83,30 @@ def share(place: Place, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     size = tell(place, len(blob))
     room = blob if place.number == 0 else np.zeros(size, np.uint8)
     return load(np.asarray(broadcast_one_to_all(room)).tobytes())
+
+
+def shared_over(members: int, envs: int, devices: int) -> tuple[int, int]:
+    """Over how many devices members are shared, and the environments of each: as many as divide.
+
+    Where several ways use as many devices, members go first.
+    """
+    return max(
+        ((a, b) for a in range(1, devices + 1) for b in range(1, devices // a + 1)
+         if members % a == 0 and envs % b == 0),
+        key=lambda ways: (ways[0] * ways[1], ways[0]),
+    )  # fmt: skip
+
+
+def check_shared(name: str, members: int, envs: int, devices: int) -> None:
+    """Refuses devices of which some would be idle.
+
+    Raises:
+      BadInput: the field `name` asked for them.
+    """
+    over_members, over_envs = shared_over(members, envs, devices)
+    if over_members * over_envs < devices:
+        raise BadInput(f"{name}: {members} members of {envs} environments cannot be shared evenly "
+                       f"over {devices} devices")  # fmt: skip
 
 
 class Follower:

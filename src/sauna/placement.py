@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
+import os
 from pathlib import Path
 
-from sauna.config import Config
+from sauna.config import Config, local_parts
 from sauna.envs.native import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.errors import BadInput
@@ -23,6 +24,8 @@ def placed(config: Config) -> Config:
     Raises:
       BadInput: a setting that is not read there.
     """
+    if ":" in config.env and has_gpu() and not local_parts(config):
+        configure_jax()  # before the user's module makes its first array, on the GPU
     if config.backend == "auto" and is_native(config.env, json.loads(config.env_kwargs)):
         config = dataclasses.replace(config, backend="device")
     if config.backend != "device":
@@ -44,10 +47,16 @@ def placed(config: Config) -> Config:
 
 
 def has_gpu() -> bool:
-    """Whether there is an NVIDIA GPU and a JAX that can use it; found without importing JAX."""
+    """Whether there is an NVIDIA GPU and a JAX that may use it; found without importing JAX."""
+    drivers = ("/proc/driver/nvidia/version", "/usr/lib/wsl/lib/libcuda.so.1")
     plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
-    return Path("/proc/driver/nvidia/version").exists() and any(
-        importlib.util.find_spec(name) is not None for name in plugins
+    hidden = os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")
+    platforms = os.environ.get("JAX_PLATFORMS") or "cuda"
+    return (
+        not hidden
+        and bool({"cuda", "gpu"} & set(platforms.split(",")))
+        and any(Path(path).exists() for path in drivers)
+        and any(importlib.util.find_spec(name) is not None for name in plugins)
     )
 
 
@@ -56,5 +65,8 @@ def look_at(config: Config) -> Probe:
     kwargs = json.loads(config.env_kwargs)
     if config.backend != "device":
         return probe(config.env, kwargs)
-    configure_jax()
+    if local_parts(config):  # trained in this process
+        configure_jax(config.devices if config.device == "cpu" else 0, config.device)
+    else:
+        configure_jax()
     return probe_on_device(config.env, kwargs)

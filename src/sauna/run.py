@@ -19,7 +19,7 @@ from sauna.config import ON_DEVICE, Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe
 from sauna.errors import BadInput, SaunaError, one_line
-from sauna.machines import Follower, join, read_place
+from sauna.machines import Follower, check_shared, join, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.placement import look_at, placed
@@ -27,7 +27,8 @@ from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_conf
 from sauna.spaces import Spaces
 from sauna.worker import configure_jax
 
-# Fields that `resume` may change: they do not touch what is computed.
+# Fields that `resume` may change: they do not touch what is computed, or only its rounding where
+# another number of devices computes it.
 RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
              "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
 
@@ -77,9 +78,8 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     """
     given = plain(given)
     config = placed(resolve(given))
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    check_read_after_settling(found.spaces, config, given)
+    _check_writes(config)
+    config, found = _looked_at(config, given)
     drop_rates = _drop_rates(members(config, given))
     TensorBoard.check(config)
     _check_plugins(config, found.spaces)
@@ -117,6 +117,29 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     return run
 
 
+def _looked_at(config: Config, given: Mapping[str, Any]) -> tuple[Config, Probe]:
+    """The config with what depends on the environment; and what was found there.
+
+    Raises:
+      BadInput: the environment cannot be used, or leaves a given field unread.
+    """
+    found = look_at(config)
+    config = settle(config, found.spaces)
+    check_read_after_settling(found.spaces, config, given)
+    return config, found
+
+
+def _check_writes(config: Config) -> None:
+    """Refuses to write the run of another machine.
+
+    Raises:
+      BadInput: this is not machine 0.
+    """
+    if read_place(config.distributed).number:
+        raise BadInput("distributed: machine 0 writes the run; the others follow it with "
+                       "`sauna train`, on the command line")  # fmt: skip
+
+
 def follows(given: Mapping[str, Any]) -> bool:
     """Whether another machine writes this run.
 
@@ -136,9 +159,7 @@ def follow(given: Mapping[str, Any], display: Display) -> None:
     config = placed(resolve(given))
     configure_jax(config.devices if config.device == "cpu" else 0, config.device)
     join(read_place(config.distributed))  # before an environment makes its first array
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    check_read_after_settling(found.spaces, config, given)
+    config, found = _looked_at(config, given)
     everyone = members(config, given)
     from sauna.training import Job, train_members
 
@@ -216,6 +237,8 @@ def settle(config: Config, spaces: Spaces) -> Config:
     number = len(config.arm) * len(config.seeds)
     processes = config.processes or os.cpu_count() or 1
     together = config.device == "gpu" or config.devices > 1 or config.distributed
+    if config.devices > 1:
+        check_shared("devices", number, config.envs, config.devices)
     if config.backend == "device" and together:
         processes = 1  # one program for all members and all devices
     return dataclasses.replace(
@@ -243,6 +266,7 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     config = dataclasses.replace(config, **{name: getattr(resolved, name) for name in changes})
     TensorBoard.check(config)
     config = placed(config)
+    _check_writes(config)
     if (config.backend == "device") != (stored["config"].get("backend") == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
     found = look_at(config)

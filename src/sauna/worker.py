@@ -108,15 +108,18 @@ def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
       simulated: on a CPU, into how many devices it is divided; 0: it is one.
       device: cpu or gpu.
     """
-    os.environ.setdefault("JAX_PLATFORMS", {"cpu": "cpu", "gpu": "cuda"}[device])
-    if os.environ["JAX_PLATFORMS"] == "cpu":
+    platform = os.environ.get("JAX_PLATFORMS") or {"cpu": "cpu", "gpu": "cuda"}[device]
+    if platform == "cpu":
         os.environ.setdefault("PJRT_NPROC", "1")
     else:  # others may share it: memory is taken as it is needed, not three quarters at once
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    ours = "jax" not in sys.modules  # else the process has chosen
     import jax
 
+    if ours:  # not in os.environ, which a later run of this process reads
+        jax.config.update("jax_platforms", platform)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if simulated > 1 and os.environ["JAX_PLATFORMS"] == "cpu":
+    if simulated > 1 and platform == "cpu":
         jax.config.update("jax_num_cpu_devices", simulated)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")

@@ -50,8 +50,8 @@ def bench_on_device(
     config = placed(resolve(given))
     if against and against != "brax":
         raise BadInput(f"against: {against} has no environments on the device; brax has")
-    if against and config.env.split("/")[0] not in ("brax", "playground"):
-        raise BadInput(f"against: brax cannot train {config.env}")
+    if against:
+        _check_peer(config)
     measures: dict[str, Callable[[], dict[str, float]]] = {
         "sauna": lambda: _elsewhere("sauna.bench.device", given, iterations)
     }
@@ -85,11 +85,29 @@ def bench_on_device(
     }
 
 
+def _check_peer(config: Config) -> None:
+    """Refuses what Brax's PPO cannot do likewise.
+
+    Raises:
+      BadInput: naming the field.
+    """
+    if config.env.split("/")[0] not in ("brax", "playground"):
+        raise BadInput(f"against: brax cannot train {config.env}")
+    if len(config.seeds) * len(config.arm) > 1:
+        raise BadInput("against: brax trains one member; give --seeds 1")
+    if config.envs % config.minibatches:
+        raise BadInput(f"minibatches: brax shares environments over them, and {config.envs} are "
+                       f"not divisible by {config.minibatches}")  # fmt: skip
+
+
 _APART = ("compile_seconds", "peak_memory_mib")  # of a round, and not a rate
 
 
 def _given(given: Mapping[str, Any], iterations: int) -> dict[str, Any]:
-    given = {**plain({"backend": "device", **given}), "processes": 1}
+    given = plain({"backend": "device", **given})
+    for name in ("processes", "distributed"):
+        if name in given:
+            raise BadInput(f"{name}: not read by a benchmark on the device, which is one process")
     config = resolve({**given, "steps": MOST_STEPS})  # room for a rollout of any size
     steps = config.rollout_steps * config.envs * iterations
     return {**given, "steps": min(steps, MOST_STEPS // config.max_env_steps_factor)}
@@ -170,9 +188,9 @@ def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
     population = make_population(job)
     compile_seconds = population.compile()
     population.run(0, 1)
-    rates = {"whole": _whole(population, iterations), **_parts(population, config, iterations)}
-    device = jax.devices()[0]
-    memory = (device.memory_stats() or {}).get("peak_bytes_in_use", 0)
+    whole = _whole(population, iterations)
+    memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
+    rates = {"whole": whole, **_parts(population, config, iterations)}
     return {**rates, "compile_seconds": compile_seconds, "peak_memory_mib": memory / 2**20}
 
 

@@ -35,21 +35,26 @@ def rate(given: dict[str, Any], iterations: int) -> float:
     if backend == "playground":
         from mujoco_playground import registry, wrapper
 
-        env = registry.load(name, config_overrides={"impl": "jax", **kwargs})
-        length = registry.get_default_config(name).episode_length
+        from sauna.envs.playground_envs import own_config
+
+        own = own_config(name, kwargs)
+        env = registry.load(name, config=own)
+        length, repeat = own.episode_length, own.action_repeat
         more: dict[str, Any] = {"wrap_env_fn": wrapper.wrap_for_brax_training}
     else:
         from brax import envs
 
-        env, length, more = envs.get_environment(name, **kwargs), 1000, {}
+        length, repeat = kwargs.pop("episode_length", 1000), kwargs.pop("action_repeat", 1)
+        env, more = envs.get_environment(name, **kwargs), {}
     batch = config.envs * config.rollout_steps
     seen: list[tuple[float, int]] = []
     train.train(
         environment=env,
-        num_timesteps=batch * iterations * EPOCHS,
+        num_timesteps=batch * repeat * iterations * EPOCHS,  # Brax counts repeated steps, too
         num_evals=EPOCHS + 1,
         run_evals=False,
         episode_length=length,
+        action_repeat=repeat,
         num_envs=config.envs,
         unroll_length=config.rollout_steps,
         batch_size=config.envs // config.minibatches,
@@ -64,12 +69,13 @@ def rate(given: dict[str, Any], iterations: int) -> float:
             networks.make_ppo_networks,
             policy_hidden_layer_sizes=config.hidden,
             value_hidden_layer_sizes=config.hidden,
+            activation={"tanh": jax.nn.tanh, "relu": jax.nn.relu}[config.activation],
         ),
         progress_fn=lambda steps, metrics: seen.append((time.perf_counter(), steps)),
         **more,
     )
     (first, before), (last, after) = seen[1] if len(seen) > 2 else seen[0], seen[-1]
-    return (after - before) / (last - first)
+    return (after - before) / repeat / (last - first)
 
 
 if __name__ == "__main__":

@@ -246,13 +246,13 @@ def _step(
         keep,
         episode_return,
         episode_length,
-        ~acting | (_finite_rows(told.observation) & jnp.isfinite(reward)),
+        ~acting | _finite_rows(state.envs.observation, told.observation, reward),
     )
     return _Carry(carry.t + 1, after, filter_state, carry.kept + keep), row
 
 
-def _finite_rows(x: Array) -> Array:
-    return jnp.all(jnp.isfinite(x.reshape(len(x), -1)), 1)
+def _finite_rows(*arrays: Array) -> Array:
+    return jnp.all(jnp.stack([jnp.isfinite(x.reshape(len(x), -1)).all(1) for x in arrays]), 0)
 
 
 def _final_values(

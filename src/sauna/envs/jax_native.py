@@ -36,6 +36,8 @@ def make_jax_env(env: str, env_kwargs: dict[str, Any]) -> JaxEnv:
         if name not in module.names():
             raise BadInput(f"env: unknown environment {env!r}{nearest(name, module.names())}")
         return _made(env, lambda: module.make(name, **env_kwargs))
+    if env in HOST_ENVS and not _is_installed("mjx"):
+        raise BadInput(f"backend: {env} on the device needs `pip install 'sauna-rl[mjx]'`")
     path = HOST_ENVS.get(env, env)
     if ":" not in path:
         raise BadInput(f"backend: {env} has no face on the device; known are {_known()}")

@@ -160,7 +160,8 @@ class RayExecutor(Executor):
             self._waiting.append(self._running.pop(unit.name))
             return
         given = unit.given(self._folder)
-        self._tasks[self._task.remote(self._hub, unit.name, given, self._git)] = unit.name
+        task = self._task.options(num_gpus=1) if given.get("device") == "gpu" else self._task
+        self._tasks[task.remote(self._hub, unit.name, given, self._git)] = unit.name
 
     def _pump(self) -> None:
         if not self._tasks:

@@ -34,7 +34,7 @@ from sauna.errors import BadInput, nearest
 from sauna.presets import ARMS, FIXED, parse_all, resolve
 
 # What a study decides itself.
-_OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard")
+_OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard", "distributed")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms")
 _ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
