@@ -80,5 +80,13 @@ def _breaks(state: State, action: jax.Array) -> Transition:
 broken = walk._replace(step=_breaks)
 
 
+def _starts_nowhere(key: jax.Array) -> tuple[State, jax.Array]:
+    state, observation = reset(key)
+    return state, observation * jnp.nan
+
+
+broken_start = walk._replace(reset=_starts_nowhere)
+
+
 def no_env(**kwargs: Any) -> int:
     return 3

@@ -98,6 +98,10 @@ def test_the_report_shows_every_figure() -> None:
         (["--scale", "--iterations", "9"], "iterations: not read with --scale"),
         (["--iterations", "1"], "iterations: must be"),
         (["--threshold", "1"], "not read by arm ppo"),
+        (["jax_worlds:walk", "--processes", "2"], "processes: not read"),
+        (["jax_worlds:walk", "--against", "brax"], "brax cannot train"),
+        (["brax/ant", "--against", "brax"], "give --seeds 1"),
+        (["brax/ant", "--against", "brax", "--seeds", "1", "--envs", "3"], "not divisible by 32"),
     ],
 )
 def test_bad_input(arguments: list[str], message: str, tmp_path, monkeypatch, capsys) -> None:

@@ -235,6 +235,9 @@ def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
     job = make_job("jax_worlds:broken", arm="ppo", envs=2)
     with pytest.raises(EnvironmentFailure, match=r"environment 0 .* step 4 .* reward"):
         train_here(job)
+    job = make_job("jax_worlds:broken_start", arm="ppo", envs=2)
+    with pytest.raises(EnvironmentFailure, match=r"step 0 .* observation"):
+        train_here(job)
     job = make_job("jax_worlds:walk", arm="ppo", envs=2, learning_rate=1e30)
     with pytest.raises(NonFinite, match="ppo/0"):
         train_here(job)

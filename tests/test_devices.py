@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sauna import rundir
+import sauna
+from sauna import placement, rundir
 from sauna.device_program import make_mesh
 from sauna.errors import BadInput
 from sauna.machines import Place, read_place
@@ -25,6 +26,12 @@ def start(out: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "sauna", "train", *SETTINGS, "--out", str(out), *more]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                             cwd=Path(__file__).parent)  # fmt: skip
+
+
+def free_address() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
 
 
 def finished(process: subprocess.Popen[str]) -> str:
@@ -52,9 +59,7 @@ def test_eight_devices_give_what_one_gives(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_machines_train_one_member_together(tmp_path: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+    address = free_address()
     other = start(tmp_path / "none", "--distributed", f"{address},2,1")
     told = finished(start(tmp_path / "both", "--distributed", f"{address},2,0"))
     finished(other)
@@ -62,6 +67,47 @@ def test_two_machines_train_one_member_together(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists(), "machine 0 alone writes"
     finished(start(tmp_path / "one"))
     assert_same_training(rundir.rows(tmp_path / "one"), rundir.rows(tmp_path / "both"))
+
+
+@pytest.mark.slow
+def test_machines_with_other_settings_do_not_train_together(tmp_path: Path) -> None:
+    address = free_address()
+    other = start(tmp_path / "none", "--distributed", f"{address},2,1", "--checkpoint-every", "3")
+    first = start(tmp_path / "both", "--distributed", f"{address},2,0")
+    for process in (first, other):
+        told, _ = process.communicate(timeout=500)
+        assert process.returncode in (1, 2) and "different settings" in told
+
+
+def test_only_machine_0_writes_a_run(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="machine 0 writes the run"):
+        sauna.train("jax_worlds:walk", distributed="h:1,2,1", quiet=True, out=tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_devices_that_would_be_idle_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"3 members of 4 environments .* evenly over 5 devices"):
+        sauna.train("jax_worlds:walk", seeds=3, envs=4, devices=5, device="cpu", quiet=True,
+                    out=tmp_path / "run")  # fmt: skip
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "variables, usable",
+    [({}, True), ({"CUDA_VISIBLE_DEVICES": "1"}, True), ({"CUDA_VISIBLE_DEVICES": ""}, False),
+     ({"CUDA_VISIBLE_DEVICES": "-1"}, False), ({"JAX_PLATFORMS": "cpu"}, False),
+     ({"JAX_PLATFORMS": "cuda,cpu"}, True)],
+)  # fmt: skip
+def test_a_gpu_that_is_hidden_is_not_used(
+    variables: dict[str, str], usable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("CUDA_VISIBLE_DEVICES", "JAX_PLATFORMS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(placement.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(placement.Path, "exists", lambda path: "nvidia" in str(path))
+    assert placement.has_gpu() == usable
 
 
 @pytest.mark.parametrize(

@@ -30,10 +30,10 @@ def run(filter: Filter, vex: np.ndarray, threshold: float = 0.3, rate: float = 0
     """The filter's mask `[S, N]`, decided step by step."""
     state = filter.init(vex.shape[1], len(vex))
     h = jax.tree.map(np.float32, hypers(threshold=threshold, drop_rate=rate))
-    masks = []
+    masks, keep = [], jax.jit(filter.keep)
     for t, x in enumerate(vex):
         key = jax.random.fold_in(jax.random.key(5), t)
-        state, mask = filter.keep(state, jnp.zeros((vex.shape[1], 2)), jnp.asarray(x), key, h)
+        state, mask = keep(state, jnp.zeros((vex.shape[1], 2)), jnp.asarray(x), key, h)
         masks.append(np.asarray(mask))
     return np.stack(masks)
 
