@@ -5,12 +5,14 @@
 
 Each mistake is made in a copy of the sources, and pytest runs on it: first the tests of that part,
 then all that are about numbers, then whole small trainings. The processes are forked from one that
-has imported JAX.
+has imported JAX. Each result is stored as it comes, and stands as long as the mutant's file is
+the same; survivors are tried again.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import re
@@ -109,7 +111,10 @@ MUTANTS = [
     *_of("core/normalize.py", "collect",
         ("spread of the means forgotten", "moments.variance + delta * move", "moments.variance"),
         ("mean moves the wrong way", "Moments(moments.mean + move", "Moments(moments.mean - move"),
-        ("no clip", ".clip(-clip, clip)", ""),
+        ("observations not clipped", "(variance + EPSILON) ** 0.5).clip(-clip, clip)",
+         "(variance + EPSILON) ** 0.5)"),
+        ("rewards not clipped", "[:, None] ** 0.5).clip(-clip, clip)", "[:, None] ** 0.5)"),
+        ("variance about the old mean", "square / count - shift**2", "square / count"),
         ("starts with a whole sample", "1e-4)", "1.0)"),
         ("inactive rows count",
          "number = weight.sum(-2)", "number = weight.sum(-2) * 0 + weight.shape[-2]"),
@@ -221,16 +226,33 @@ def main() -> int:
         broken = _failing_test(copy, QUICK)
         log = (copy.parent / "log").read_text()[-3000:]
         assert broken is None, f"{broken} fails on the sources as they are\n{log}"
-        found = [_try(mutant, copy) for mutant in chosen]
-    caught = sum(row["caught_by"] is not None for row in found)
-    alike = sum(row["equivalent"] is not None for row in found)
-    print(f"{caught} of {len(found)} caught, {alike} equivalent")
-    if not given.only:
-        share = caught / (len(found) - alike)
-        result = {"mutants": len(found), "caught": caught, "equivalent": alike, "share": share,
-                  "rows": found}  # fmt: skip
-        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
-    return int(caught + alike < len(found))
+        found, before = [], {} if given.only else _caught_before()
+        for mutant in chosen:
+            found.append(before.get(_identity(mutant)) or _try(mutant, copy))
+            result = _counted(found)
+            if not given.only:
+                RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    print(f"{result['caught']} of {len(found)} caught, {result['equivalent']} equivalent")
+    return int(result["share"] < 1.0)
+
+
+def _identity(mutant: Mutant) -> tuple[str, str]:
+    """Of a mutant and the file that it is made in, as it is now."""
+    source = (ROOT / "src" / "sauna" / mutant.file).read_bytes()
+    return f"{mutant.file}: {mutant.name}", hashlib.sha256(source).hexdigest()[:16]
+
+
+def _caught_before() -> dict[tuple[str, str], dict[str, Any]]:
+    rows = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
+    return {(row["name"], row["source"]): row for row in rows if row["caught_by"] is not None}
+
+
+def _counted(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    caught = sum(row["caught_by"] is not None for row in rows)
+    alike = sum(row["equivalent"] is not None for row in rows)
+    share = caught / max(len(rows) - alike, 1)
+    return {"mutants": len(rows), "caught": caught, "equivalent": alike, "share": share,
+            "rows": rows}  # fmt: skip
 
 
 def _import_libraries() -> None:
@@ -248,7 +270,7 @@ def _import_libraries() -> None:
 
 
 def _try(mutant: Mutant, copy: Path) -> dict[str, Any]:
-    path, name = copy / "sauna" / mutant.file, f"{mutant.file}: {mutant.name}"
+    path, (name, source) = copy / "sauna" / mutant.file, _identity(mutant)
     plain = path.read_text()
     assert plain.count(mutant.old) == 1, f"{name}: {plain.count(mutant.old)} places"
     clock = time.monotonic()
@@ -258,7 +280,8 @@ def _try(mutant: Mutant, copy: Path) -> dict[str, Any]:
         caught = next(filter(None, (_failing_test(copy, stage) for stage in stages)), None)
     finally:
         path.write_text(plain)
-    row = {"name": name, "caught_by": caught, "equivalent": EQUIVALENT.get(name),
+    row = {"name": name, "source": source, "caught_by": caught,
+           "equivalent": None if caught else EQUIVALENT.get(name),
            "seconds": round(time.monotonic() - clock, 1)}  # fmt: skip
     print(json.dumps(row), flush=True)
     return row

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from faults import campaign, docs
+from faults import campaign, docs, mutants
 from faults.result import Result
 
 
@@ -27,3 +27,9 @@ def test_the_page_shows_what_was_measured(tmp_path: Path) -> None:
     shutil.copy(campaign.DOCS, page)
     docs.write(page, campaign.load())
     assert page.read_text() == campaign.DOCS.read_text(), "run campaign.py --docs"
+
+
+def test_every_mistake_has_its_place() -> None:
+    for mutant in mutants.MUTANTS:
+        source = (campaign.ROOT / "src" / "sauna" / mutant.file).read_text()
+        assert source.count(mutant.old) == 1, f"{mutant.file}: {mutant.name}"
