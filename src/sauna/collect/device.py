@@ -142,6 +142,7 @@ def collect(
     filter_key = jax.random.fold_in(keys.filter, iteration)
     filter_state = parts.filter.init(config.envs, room) if parts.filter else ()
     carry = _Carry(jnp.int32(0), state, filter_state, jnp.zeros(config.envs, jnp.int32))
+    begun = _finite_rows(state.envs.observation)  # the run's first ones no step has looked at
 
     def step(carry: _Carry) -> tuple[_Carry, _Row]:
         acting = (carry.kept < config.rollout_steps) & (carry.t < limit)
@@ -152,7 +153,7 @@ def collect(
         carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=room)
     else:
         carry, rows = _until_full(parts, step, carry, room, limit)
-    return _finish(parts, params, carry.state, rows, hypers)
+    return _finish(parts, params, carry.state, rows, begun, hypers)
 
 
 def _until_full(
@@ -246,7 +247,7 @@ def _step(
         keep,
         episode_return,
         episode_length,
-        ~acting | _finite_rows(state.envs.observation, told.observation, reward),
+        ~acting | _finite_rows(told.observation, envs.observation, reward),
     )
     return _Carry(carry.t + 1, after, filter_state, carry.kept + keep), row
 
@@ -271,7 +272,12 @@ def _final_values(
 
 
 def _finish(
-    parts: Collecting, params: Array, state: CollectState, rows: _Row, hypers: Hypers
+    parts: Collecting,
+    params: Array,
+    state: CollectState,
+    rows: _Row,
+    begun: Array,
+    hypers: Hypers,
 ) -> tuple[CollectState, Rollout, Ends, Faults]:
     """Scales the rewards and looks back over the rows `[S, N]`."""
     reward, state = _scaled_rewards(parts.config, state, rows, hypers)
@@ -288,7 +294,7 @@ def _finish(
         rows.valid,
         rows.keep,
     )
-    return state, rollout, _ends(rows), _faults(rows)
+    return state, rollout, _ends(rows), _faults(rows, begun)
 
 
 def _next_values(parts: Collecting, params: Array, state: CollectState, rows: _Row) -> Array:
@@ -342,10 +348,14 @@ def _ends(rows: _Row) -> Ends:
     )
 
 
-def _faults(rows: _Row) -> Faults:
-    """`argmax` of a mask is its first true entry, in time order."""
-    bad = rows.valid & ~rows.finite
+def _faults(rows: _Row, begun: Array) -> Faults:
+    """`argmax` of a mask is its first true entry, in time order.
+
+    An observation that the rollout begins with (`begun` `[N]`: it is finite) comes before its row.
+    """
+    bad, early = rows.valid & ~rows.finite, ~jnp.all(begun)
+    bad = bad.at[0].set(jnp.where(early, ~begun, bad[0]))
     place = jnp.argmax(bad)
     row, env = jnp.unravel_index(place, bad.shape)
-    in_reward = ~jnp.isfinite(rows.reward[row, env])
+    in_reward = ~jnp.isfinite(rows.reward[row, env]) & ~early
     return Faults(jnp.any(bad), row.astype(jnp.int32), env.astype(jnp.int32), in_reward)
