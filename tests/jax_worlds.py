@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna import JaxEnv, Transition
+from sauna.core.population import member_keys
 
 LENGTH = 12
 
@@ -86,6 +87,58 @@ def _starts_nowhere(key: jax.Array) -> tuple[State, jax.Array]:
 
 
 broken_start = walk._replace(reset=_starts_nowhere)
+
+FIELDS = ("first", "observation", "final", "reward")  # what of an episode can be poisoned
+
+
+class PoisonedState(NamedTuple):
+    steps: jax.Array
+    cut: jax.Array  # whether its time limit comes first
+    bad: jax.Array  # whether this is the episode
+
+
+class Poison(NamedTuple):
+    """One number that is none, in one place of one episode. All may be traced."""
+
+    key: Any  # that the episode is reset with
+    field: Any  # of `FIELDS`, its index
+    value: Any
+    component: Any  # of the observation
+    step: Any  # of that episode, from 1; not read where the field says when
+
+
+def poisoned(poison: Poison) -> JaxEnv:
+    """Episodes of 4 steps, one of them with that number."""
+
+    def now(name: str) -> Any:
+        return jnp.asarray(poison.field) == FIELDS.index(name)
+
+    def observe(state: PoisonedState, here: Any) -> jax.Array:
+        wrong = (jnp.arange(3) == poison.component) & state.bad & here
+        return jnp.where(wrong, poison.value, jnp.full(3, 0.1 * state.steps))
+
+    def reset(own: jax.Array) -> tuple[PoisonedState, jax.Array]:
+        bad = jnp.all(jax.random.key_data(own) == jax.random.key_data(poison.key))
+        state = PoisonedState(jnp.int32(0), jax.random.bernoulli(own), bad)
+        return state, observe(state, now("first"))
+
+    def move(state: PoisonedState, action: jax.Array) -> Transition:
+        after = state._replace(steps=state.steps + 1)
+        ended, here = after.steps == 4, after.steps == poison.step
+        wrong = (here & now("observation")) | (ended & now("final"))
+        spoiled = here & state.bad & now("reward")
+        reward = jnp.where(spoiled, poison.value, jnp.sum(action))
+        return Transition(
+            after, observe(after, wrong), reward, ended & ~state.cut, ended & state.cut
+        )
+
+    return JaxEnv(reset, move, gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32), _PUSH)
+
+
+def unlucky() -> JaxEnv:
+    """Gives a NaN in the fourth episode of the member with seed 1, and only there."""
+    own = jax.random.fold_in(member_keys(1).env, 0)
+    return poisoned(Poison(jax.random.fold_in(own, 3), FIELDS.index("reward"), jnp.nan, 0, 2))
 
 
 def no_env(**kwargs: Any) -> int:

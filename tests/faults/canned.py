@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from unittest.mock import patch
@@ -23,14 +23,16 @@ from sauna.wire import Shared, Worker, receive, send, start_thread
 from sauna.worker import PipeReporter
 
 WORLD = "worlds:Scripted"
+BACKENDS = {"host": WORLD, "device": "jax_worlds:walk"}
 SETTINGS = {**SMALL, "arm": "ppo", "steps": 192, "processes": 1}
 SAVED = {"checkpoint_every": 2, "keep_checkpoints": 2}
 ITERATIONS = 6
 
 
-def record() -> Recorder:
+@cache
+def record(world: str = WORLD) -> Recorder:
     """Rows of every iteration and the state at the start of each."""
-    return train_here(make_job(WORLD, **SETTINGS, checkpoint_every=1))
+    return train_here(make_job(world, **SETTINGS, checkpoint_every=1))
 
 
 def serve(recorder: Recorder, inbox: Connection, outlet: Connection) -> None:
@@ -73,12 +75,12 @@ def played_back(recorder: Recorder) -> Iterator[None]:
         yield
 
 
-def go(run: Path) -> None:
+def go(run: Path, world: str = WORLD) -> None:
     """Starts the run, or continues it where it is."""
     if (run / "config.json").exists():
         sauna.resume(run, quiet=True)
     else:
-        sauna.train(WORLD, out=run, quiet=True, **SAVED, **SETTINGS)
+        sauna.train(world, out=run, quiet=True, **SAVED, **SETTINGS)
 
 
 class Trap:
@@ -101,12 +103,12 @@ class Trap:
             self.saved.add(op.data)
 
 
-def until(run: Path, hook: Hook) -> BaseException | None:
+def until(run: Path, hook: Hook, world: str = WORLD) -> BaseException | None:
     """Lets the run go on with `hook` at every file operation; how it ended."""
     run.mkdir(parents=True, exist_ok=True)
     try:
         with watched(run, hook):
-            go(run)
+            go(run, world)
     except (Crash, Exception) as error:
         return error
     return None

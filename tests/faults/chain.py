@@ -6,7 +6,7 @@ import os
 import random
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from faults.nursery import Nursery, Process, Started
@@ -15,22 +15,22 @@ from sauna import checkpoint, rundir
 
 SETTINGS = {"rollout-steps": 32, "minibatches": 4, "epochs": 2, "hidden": "8,8", "seeds": 2,
             "arm": "sauna", "threshold": 0.9, "checkpoint-every": 2, "processes": 1}  # fmt: skip
+# Where a run's environments are stepped: the environment, and what else differs.
+BACKENDS: dict[str, tuple[str, dict[str, object]]] = {
+    "host": ("worlds:Scripted", {}),
+    "device": ("jax_worlds:walk", {"checkpoint-every": 5}),  # several iterations per call
+}
 PATIENCE = 180.0  # seconds after which a process that should have ended counts as hung
 Start = Callable[[list[str], Path], Process]
-
-
-def train_arguments(run: Path, **settings: object) -> list[str]:
-    flags = [f"--{name}={value}" for name, value in {**SETTINGS, **settings}.items()]
-    return ["train", "worlds:Scripted", "--out", str(run), *flags]
 
 
 class Reference:
     """The run that was left alone: every checkpoint's bytes, and the whole log."""
 
-    def __init__(self, start: Start, run: Path, iterations: int) -> None:
-        self.steps = 32 * iterations
+    def __init__(self, start: Start, run: Path, iterations: int, backend: str) -> None:
+        self.backend, self._steps = backend, 32 * iterations
         every = {"checkpoint-every": 1, "keep-checkpoints": 100_000}
-        arguments = train_arguments(run, steps=self.steps, **every)
+        arguments = self.arguments(run, every)
         process = start(arguments, run.with_suffix(".log"))
         assert process.wait(PATIENCE) == 0, process.said()
         self.metrics = (run / "metrics.jsonl").read_bytes()
@@ -39,13 +39,21 @@ class Reference:
             for path in checkpoint.numbered(run / "checkpoints")
         }
 
+    def arguments(self, run: Path, more: Mapping[str, object] | None = None) -> list[str]:
+        """Of `sauna`, for a run that is the same."""
+        env, own = BACKENDS[self.backend]
+        settings = {**SETTINGS, "steps": self._steps, **own, **(more or {})}
+        flags = [f"--{name}={value}" for name, value in settings.items()]
+        return ["train", env, "--out", str(run), *flags]
+
 
 class Stage:
     """A nursery, and the reference that all runs of it are compared with."""
 
-    def __init__(self, place: Path, iterations: int = 400) -> None:
+    def __init__(self, place: Path, backend: str = "host", iterations: int = 400) -> None:
         self.nursery = Nursery()
-        self.reference = Reference(self.nursery.start, place / "whole", iterations)
+        whole = place / f"whole-{backend}"
+        self.reference = Reference(self.nursery.start, whole, iterations, backend)
 
     def chain(self, run: Path, tally: Tally) -> Chain:
         return Chain(run, self.reference, self.nursery.start, tally)
@@ -55,6 +63,15 @@ class Stage:
 
     def __exit__(self, *error: object) -> None:
         self.nursery.close()
+
+
+def on_each_backend(place: Path, tally: Tally, iterations: int = 400) -> Iterator[Stage]:
+    """A stage on the host, then one on the device; the trials on each are counted."""
+    for backend in BACKENDS:
+        before = tally.tried
+        with Stage(place, backend, iterations) as stage:
+            yield stage
+        tally.count(f"on the {backend}", tally.tried - before)
 
 
 class Chain:
@@ -73,7 +90,7 @@ class Chain:
             more = random.Random(self.links).choice([1, 2])  # files do not depend on it
             arguments = ["resume", str(self.run), f"--processes={more}"]
         else:
-            arguments = train_arguments(self.run, steps=self._reference.steps)
+            arguments = self._reference.arguments(self.run)
         self.links += 1
         return start(arguments, self.run.with_suffix(".log"))
 

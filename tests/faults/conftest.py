@@ -9,7 +9,9 @@ import pytest
 from faults.chain import Stage
 
 
-@pytest.fixture(scope="session")
-def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    with Stage(tmp_path_factory.mktemp("stage"), iterations=60) as made:
+@pytest.fixture(scope="session", params=["host", pytest.param("device", marks=pytest.mark.slow)])
+def stage(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Stage]:
+    with Stage(tmp_path_factory.mktemp("stage"), request.param, iterations=60) as made:
         yield made

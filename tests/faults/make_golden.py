@@ -1,4 +1,4 @@
-"""Writes `golden/format-N`: a run as this version leaves it when it is killed.
+"""Writes `golden/format-N-BACKEND`: a run as this version leaves it when it is killed.
 
     python tests/faults/make_golden.py
 
@@ -20,18 +20,23 @@ GOLDEN = Path(__file__).resolve().parent / "golden"
 
 def main() -> None:
     import sauna
-    from faults.canned import SETTINGS, WORLD
+    from faults.canned import BACKENDS, SETTINGS
     from sauna.checkpoint import FORMAT, numbered
 
-    run = Path(f"format-{FORMAT}")
     GOLDEN.mkdir(exist_ok=True)
     os.chdir(GOLDEN)
-    with patch("sauna.rundir.git_revision", lambda: None), patch("sauna.rundir.machine", dict):
-        sauna.train(WORLD, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=3, **SETTINGS)
-    for path in (run / "summary.json", run / ".lock"):
-        path.unlink()
-    shutil.rmtree(run / "figures")
-    shutil.rmtree(numbered(run / "checkpoints")[-1])
+    for backend, world in BACKENDS.items():
+        run = Path(f"format-{FORMAT}-{backend}")
+        if run.exists():
+            continue
+        with patch("sauna.rundir.git_revision", lambda: None), patch("sauna.rundir.machine", dict):
+            sauna.train(
+                world, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=3, **SETTINGS
+            )
+        for path in (run / "summary.json", run / ".lock"):
+            path.unlink()
+        shutil.rmtree(run / "figures")
+        shutil.rmtree(numbered(run / "checkpoints")[-1])
 
 
 if __name__ == "__main__":

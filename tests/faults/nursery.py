@@ -126,7 +126,9 @@ def _warm() -> None:
     import rich.console
     import scipy.stats
 
+    import jax_worlds
     import sauna.coordinator
+    import sauna.device_training
     import sauna.evaluation
     import sauna.run
     import sauna.training
@@ -140,7 +142,7 @@ def _warm() -> None:
     numbers.see(one, np.ones((1, 1), bool))
     numbers.see_and_normalize(one, np.ones((1, 1), bool), np.zeros((1, 1, 1), np.float32))
     numbers.normalize(one, np.zeros((1, 1, 1), np.float32))
-    del matplotlib, rich, scipy, sauna, worlds
+    del jax_worlds, matplotlib, rich, scipy, sauna, worlds
 
 
 class _ForkedWorker:

@@ -7,7 +7,17 @@ import signal
 import time
 from pathlib import Path
 
-from faults.chain import Chain, Stage, children, is_saving, orphans, send, wait_for_rows, wait_until
+from faults.chain import (
+    Chain,
+    Stage,
+    children,
+    is_saving,
+    on_each_backend,
+    orphans,
+    send,
+    wait_for_rows,
+    wait_until,
+)
 from faults.result import Result, Tally, assert_held
 
 AIMS = ("save", "save", "rows", "start")
@@ -15,27 +25,29 @@ CHAIN = 25  # kills of one run
 
 
 def experiment(kills: int, seed: int, place: Path) -> Result:
-    """Kills runs again and again, in chains of 25 kills of one run.
+    """Kills runs again and again, in chains of 25 kills of one run; `kills` on each backend.
 
     A third of the kills hit the coordinator alone, whose workers then have to end by themselves;
     every tenth process is started as a user starts it. `worst`: seconds from a resume's start to
     its first new row.
     """
-    with Stage(place) as stage:
-        return _kill_again_and_again(stage, kills, seed, place)
+    tally = Tally()
+    for stage in on_each_backend(place, tally):
+        _kill_again_and_again(stage, kills, random.Random(seed), place, tally)
+    return tally.result()
 
 
-def _kill_again_and_again(stage: Stage, kills: int, seed: int, place: Path) -> Result:
-    rng, tally = random.Random(seed), Tally()
-    chain, in_chain = stage.chain(place / "run", tally), 0
-    while tally.tried < kills:
+def _kill_again_and_again(
+    stage: Stage, kills: int, rng: random.Random, place: Path, tally: Tally
+) -> None:
+    chain, in_chain, end = stage.chain(place / "run", tally), 0, tally.tried + kills
+    while tally.tried < end:
         in_chain += _kill(chain, rng, tally, fresh=tally.tried % 10 == 9)
-        if in_chain == CHAIN or chain.is_complete() or tally.tried == kills:
+        if in_chain == CHAIN or chain.is_complete() or tally.tried == end:
             if not chain.is_complete():
                 chain.finish()
             tally.notes["longest chain"] = max(tally.notes.get("longest chain", 0), in_chain)
             chain, in_chain = stage.chain(place / "run", tally), 0
-    return tally.result()
 
 
 def _kill(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> bool:
@@ -70,4 +82,6 @@ def _kill(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> bool:
 
 
 def test_killed_at_any_moment_it_goes_on_to_the_same_bytes(stage: Stage, tmp_path: Path) -> None:
-    assert_held(_kill_again_and_again(stage, 3, 1, tmp_path), 3)
+    tally = Tally()
+    _kill_again_and_again(stage, 3, random.Random(1), tmp_path, tally)
+    assert_held(tally.result(), 3)

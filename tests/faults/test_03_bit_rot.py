@@ -8,16 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
+from faults.canned import BACKENDS, record
 from faults.result import Result, Tally, assert_held
-from helpers import equal, make_job, train_here
+from helpers import equal
 from sauna import checkpoint
 
 OLD, NEW = 3, 4
 
 
-def _save_two(folder: Path) -> dict[int, dict[str, np.ndarray]]:
+def _save_two(folder: Path, world: str) -> dict[int, dict[str, np.ndarray]]:
     """Two checkpoints of a real training."""
-    states = train_here(make_job("worlds:Scripted", arm="ppo", checkpoint_every=1)).states
+    states = record(world).states
     for iteration in (OLD, NEW):
         manifest = {"config": {"gamma": 0.99, "adam_epsilon": 1e-5}, "members": ["ppo/0"],
                     "logs": {"metrics.jsonl": 100 * iteration}}  # fmt: skip
@@ -28,12 +29,18 @@ def _save_two(folder: Path) -> dict[int, dict[str, np.ndarray]]:
 def experiment(flips: int, seed: int, place: Path) -> Result:
     """Flips a bit of the newest checkpoint, or cuts one of its files to any length.
 
-    With every length where `flips` is large, with 50 of each file otherwise. A flip inside the
-    manifest's JSON that leaves every value as it was (`1e-05` and `1E-05`) changes nothing and is
-    counted apart. `worst`: seconds of the slowest load.
+    On each backend; with every length where `flips` is large, with 50 of each file otherwise. A
+    flip inside the manifest's JSON that leaves every value as it was (`1e-05` and `1E-05`) changes
+    nothing and is counted apart. `worst`: seconds of the slowest load.
     """
-    rng, tally = random.Random(seed), Tally()
-    states = _save_two(place)
+    tally = Tally()
+    for backend in BACKENDS:
+        _spoil(backend, flips, random.Random(seed), place / backend, tally)
+    return tally.result()
+
+
+def _spoil(backend: str, flips: int, rng: random.Random, place: Path, tally: Tally) -> None:
+    states = _save_two(place, BACKENDS[backend])
     newest = place / f"{NEW:08d}"
     whole = {path: path.read_bytes() for path in newest.iterdir()}
     bits = [(path, bit) for path, data in whole.items() for bit in range(8 * len(data))]
@@ -47,7 +54,6 @@ def experiment(flips: int, seed: int, place: Path) -> Result:
         for length in lengths if flips >= 10_000 else rng.sample(lengths, 50):
             _judge(path, data[:length], whole, states, tally, f"cut to {length} bytes")
             tally.count("truncations")
-    return tally.result()
 
 
 def _judge(
@@ -86,4 +92,6 @@ def _means_the_same(path: Path, changed: bytes, whole: bytes) -> bool:
 
 
 def test_every_flip_and_every_truncation_is_noticed(tmp_path: Path) -> None:
-    assert_held(experiment(300, 0, tmp_path), 300)
+    tally = Tally()
+    _spoil("host", 300, random.Random(0), tmp_path, tally)
+    assert_held(tally.result(), 300)

@@ -5,28 +5,32 @@ from __future__ import annotations
 import itertools
 import random
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 import sauna
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
+from jax_worlds import FIELDS, Poison, poisoned
 from sauna import checkpoint, rundir
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
 from sauna.core.types import Hypers
+from sauna.device_program import Report, init_member, iterate, make_parts, several
+from sauna.device_training import _check_sound, _setting
 from sauna.envs.contract import HostEnvs
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
+from sauna.envs.jax_env import flat
 from sauna.envs.workers import ProcessEnvs
 from sauna.errors import SaunaError
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
-FIELDS = ("first", "observation", "final", "reward")
 VALUES = ("nan", "inf", "-inf")
-# A new backend joins the matrix by a line here.
 BACKENDS = {
     "in-process": lambda kwargs: GymnasiumEnvs(env_maker("worlds:Poisoned", kwargs), SEEDS),
     "workers": lambda kwargs: ProcessEnvs("worlds:Poisoned", kwargs, SEEDS, 2, timeout=60.0),
@@ -45,7 +49,7 @@ def cases() -> list[dict[str, Any]]:
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
-    """The matrix in one process, and a part of it in workers; then inside of a rollout.
+    """The matrix in one process, and a part of it in workers; inside of a rollout; on the device.
 
     `worst`: seconds from the step that gave the number to the error.
     """
@@ -57,6 +61,9 @@ def experiment(least: int, seed: int, place: Path) -> Result:
         _play("workers", kwargs, tally)
     for kwargs in rng.sample(everything, 4 if least >= 50 else 1):
         _collect(kwargs, tally)
+    on_device = OnDevice()
+    for number, kwargs in enumerate(chosen):
+        on_device.play(number % ENVS, kwargs, tally)
     return tally.result()
 
 
@@ -121,6 +128,53 @@ def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
     parts = [moments.mean, moments.variance, collector._observed, *collector.reward_moments]
     if not all(np.isfinite(part).all() for part in parts):
         tally.miss(f"{kwargs}: it reached the moments or the buffer")
+
+
+ENVS = 3  # on the device
+ROLLOUT = 32
+LENGTH = 4  # of an episode of `jax_worlds.poisoned`
+
+
+class OnDevice:
+    """The device's own iterations, compiled once: where the bad number is, is traced."""
+
+    def __init__(self) -> None:
+        steps = 3 * ROLLOUT * ENVS
+        plain = make_job("worlds:Scripted", arm="ppo", envs=ENVS, steps=steps)
+        spaces = plain.spaces._replace(action_sizes=(1,))
+        config, self._member = plain.config, plain.members[0]
+        self._setting = _setting(self._member, [0.0], 1)
+
+        def run(poison: Poison) -> Report:
+            parts = make_parts(config, spaces, flat(poisoned(poison)), lambda here: here)
+            state = init_member(parts, self._setting)
+            return several(partial(iterate, parts), state, self._setting, 0, 3)[1]
+
+        self._run = jax.jit(run)
+
+    def play(self, env: int, kwargs: dict[str, Any], tally: Tally) -> None:
+        """The first episodes, or ten later: those are in the second rollout."""
+        episode = kwargs["episode"] - 1 if kwargs["episode"] == 1 else kwargs["episode"] + 5
+        own = jax.random.fold_in(self._setting.keys.env, env)
+        field = kwargs["field"]
+        poison = Poison(jax.random.fold_in(own, episode), FIELDS.index(field),
+                        float(kwargs["value"]), kwargs["component"], kwargs["step"])  # fmt: skip
+        reports = jax.device_get(self._run(poison))
+        tally.tried += 1
+        tally.count("device")
+        at = {"first": 0, "final": LENGTH}.get(field, kwargs["step"]) + LENGTH * episode
+        iteration, row = divmod(max(at - 1, 0), ROLLOUT)
+        what = "reward" if field == "reward" else "observation"
+        wanted = (f"environment {env} of ppo/0, iteration {iteration}, step {row} of the rollout: "
+                  f"{what} is not finite")  # fmt: skip
+        message = "it got through"
+        for i in np.flatnonzero(reports.ran):
+            try:
+                _check_sound(self._member, i, jax.tree.map(lambda x: x[i], reports))  # noqa: B023
+            except SaunaError as error:
+                message = str(error)
+        if message != wanted:
+            tally.miss(f"device: {kwargs}: says {message!r} instead of {wanted!r}")
 
 
 def test_no_number_that_is_none_is_learned_from(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from faults.chain import (
     Stage,
     children,
     is_alive,
+    on_each_backend,
     orphans,
     send,
-    train_arguments,
     wait_for_rows,
 )
 from faults.result import Result, Tally, assert_held
@@ -57,7 +57,8 @@ def experiment(least: int, seed: int, place: Path) -> Result:
             _from_outside(rng, tally)
         else:
             _from_inside(rng, tally)
-    _training_processes(whole, rng, place, tally)
+    for stage in on_each_backend(place, tally, iterations=200):
+        _training_processes(stage, whole, rng, place, tally)
     return tally.result()
 
 
@@ -122,21 +123,22 @@ def _until_named(
         tally.lose(f"{what}: a worker is still there")
 
 
-def _training_processes(number: int, rng: random.Random, place: Path, tally: Tally) -> None:
-    """A training process of a run, or an environment worker of it, is killed or stopped."""
-    with Stage(place, iterations=200) as stage:
-        chain = stage.chain(place / "run", tally)
-        for _ in range(number):
-            what = rng.choice(["SIGKILL", "SIGSTOP", "coordinator"])
-            arguments = train_arguments(chain.run, steps=stage.reference.steps, processes=2)
-            if (chain.run / "config.json").exists():
-                arguments = ["resume", str(chain.run), "--processes=2"]
-            process = stage.nursery.start(arguments, chain.run.with_suffix(".log"), silence=4.0)
-            wait_for_rows(chain, process, rng.randrange(1, 8000))
-            _strike_run(chain, process, what, rng, tally)
-            if chain.is_complete():
-                chain = stage.chain(place / "run", tally)
-        chain.finish()
+def _training_processes(
+    stage: Stage, number: int, rng: random.Random, place: Path, tally: Tally
+) -> None:
+    """A training process of a run is killed or stopped."""
+    chain = stage.chain(place / "run", tally)
+    for _ in range(number):
+        what = rng.choice(["SIGKILL", "SIGSTOP", "coordinator"])
+        arguments = stage.reference.arguments(chain.run, {"processes": 2})
+        if (chain.run / "config.json").exists():
+            arguments = ["resume", str(chain.run), "--processes=2"]
+        process = stage.nursery.start(arguments, chain.run.with_suffix(".log"), silence=4.0)
+        wait_for_rows(chain, process, rng.randrange(1, 8000))
+        _strike_run(chain, process, what, rng, tally)
+        if chain.is_complete():
+            chain = stage.chain(place / "run", tally)
+    chain.finish()
 
 
 def _strike_run(chain: Chain, process: Any, what: str, rng: random.Random, tally: Tally) -> None:

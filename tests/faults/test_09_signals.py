@@ -7,30 +7,41 @@ import signal
 import time
 from pathlib import Path
 
-from faults.chain import PATIENCE, Chain, Stage, children, orphans, send, wait_for_rows
+from faults.chain import (
+    PATIENCE,
+    Chain,
+    Stage,
+    children,
+    on_each_backend,
+    orphans,
+    send,
+    wait_for_rows,
+)
 from faults.result import Result, Tally, assert_held
 from sauna import checkpoint
 
 
 def experiment(signals: int, seed: int, place: Path) -> Result:
-    """Stops runs with SIGINT and SIGTERM at random moments, one in four twice.
+    """Stops runs with SIGINT and SIGTERM at random moments, one in four twice; on each backend.
 
     `worst`: seconds from the first signal to the end of the process.
     """
-    with Stage(place) as stage:
-        return _stop_again_and_again(stage, signals, seed, place)
+    tally = Tally()
+    for stage in on_each_backend(place, tally):
+        _stop_again_and_again(stage, signals, random.Random(seed), place, tally)
+    return tally.result()
 
 
-def _stop_again_and_again(stage: Stage, signals: int, seed: int, place: Path) -> Result:
-    rng, tally = random.Random(seed), Tally()
-    chain = stage.chain(place / "run", tally)
-    while tally.tried < signals:
+def _stop_again_and_again(
+    stage: Stage, signals: int, rng: random.Random, place: Path, tally: Tally
+) -> None:
+    chain, end = stage.chain(place / "run", tally), tally.tried + signals
+    while tally.tried < end:
         _signal(chain, rng, tally, fresh=tally.tried % 10 == 9)
-        if chain.is_complete() or tally.tried == signals:
+        if chain.is_complete() or tally.tried == end:
             if not chain.is_complete():
                 chain.finish()
             chain = stage.chain(place / "run", tally)
-    return tally.result()
 
 
 def _signal(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> None:
@@ -76,4 +87,6 @@ def _count(chain: Chain, said: str, tally: Tally, what: str) -> None:
 
 
 def test_a_signal_saves_and_a_second_one_leaves_a_safe_state(stage: Stage, tmp_path: Path) -> None:
-    assert_held(_stop_again_and_again(stage, 3, 2, tmp_path), 3)
+    tally = Tally()
+    _stop_again_and_again(stage, 3, random.Random(2), tmp_path, tally)
+    assert_held(tally.result(), 3)

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from faults.canned import Ended, Trap, go, played_back, record, until
+from faults.canned import BACKENDS, Ended, Trap, go, played_back, record, until
 from faults.disk import Op, tree_of, watched
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
-from helpers import Recorder
 from sauna import checkpoint, cli
 from sauna.errors import BadInput, SaunaError
 
@@ -23,31 +22,37 @@ ERRORS = (errno.ENOSPC, errno.EROFS, errno.EIO)
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
-    """The operations of one run fail, each with some error; all of them if there is room.
+    """The operations of a run fail, each with some error; all if there is room, on each backend.
 
     `worst`: seconds from the failing operation to the end of the command.
     """
-    rng, tally, recorder = random.Random(seed), Tally(), record()
-    with played_back(recorder):
+    tally = Tally()
+    for backend in BACKENDS:
+        _fail_everywhere(backend, least, random.Random(seed), place, tally)
+    return tally.result()
+
+
+def _fail_everywhere(
+    backend: str, least: int, rng: random.Random, place: Path, tally: Tally
+) -> None:
+    world = BACKENDS[backend]
+    with played_back(record(world)):
         whole = Trap()
-        until(place / "whole", whole)
-        expected = Ended(place / "whole")
-        tally.notes["file operations of a run"] = len(whole.ops)
+        until(place / backend, whole, world)
+        expected = Ended(place / backend)
+        tally.count(f"file operations of a run on the {backend}", len(whole.ops))
         cases = [(at, number) for at in range(len(whole.ops)) for number in ERRORS]
         if least < len(whole.ops):
             cases = rng.sample(cases, least)
         for at, number in cases:
-            _fail(place / "run", at, number, expected, recorder, tally)
-    return tally.result()
+            _fail(place / "run", world, at, number, expected, tally)
 
 
-def _fail(
-    run: Path, at: int, number: int, expected: Ended, recorder: Recorder, tally: Tally
-) -> None:
+def _fail(run: Path, world: str, at: int, number: int, expected: Ended, tally: Tally) -> None:
     shutil.rmtree(run, ignore_errors=True)
     trap = Trap(at, OSError(number, os.strerror(number), "the disk"))
     clock = time.monotonic()
-    error = until(run, trap)
+    error = until(run, trap, world)
     tally.took(time.monotonic() - clock)
     tally.tried += 1
     op = trap.ops[at] if at < len(trap.ops) else None
@@ -59,7 +64,7 @@ def _fail(
         tally.lose(f"{what}: told as bad input: {error}")
     _check_kept(run, trap, what, tally)
     try:
-        go(run)  # there is space again
+        go(run, world)  # there is space again
     except SaunaError as again:
         tally.lose(f"{what}: cannot go on: {again}")
         return
@@ -81,14 +86,16 @@ def _check_kept(run: Path, trap: Trap, what: str, tally: Tally) -> None:
 
 
 def test_every_failing_write_is_told_and_loses_nothing(tmp_path: Path) -> None:
-    assert_held(experiment(30, 3, tmp_path), 30)
+    tally = Tally()
+    _fail_everywhere("host", 30, random.Random(3), tmp_path, tally)
+    assert_held(tally.result(), 30)
 
 
 def test_an_evaluation_that_cannot_be_written_is_one_line(tmp_path: Path, capsys) -> None:
     """And the run that it evaluates is as it was."""
     number = errno.EROFS
     run = tmp_path / "run"
-    shutil.copytree(next(GOLDEN.iterdir()), run)
+    shutil.copytree(GOLDEN / "format-1-host", run)
     before = tree_of(run)
 
     def fail(op: Op) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from faults.chain import Chain, Stage, children, orphans, send, train_arguments
+from faults.chain import Chain, Stage, children, on_each_backend, orphans, send
 from faults.nursery import Nursery, Process
 from faults.result import Result, Tally, assert_held
 
@@ -20,24 +20,27 @@ AT_A_TIME = 3
 def experiment(races: int, seed: int, place: Path) -> Result:
     """Lets three processes resume one run at the same moment, or start one in the same folder.
 
-    The winner is then killed, so that the next race begins with the lock of a dead process.
+    The winner is then killed, so that the next race begins with the lock of a dead process;
+    `races` on each backend.
     `worst`: seconds until the losers have ended.
     """
-    with Stage(place) as stage:
-        return _race_again_and_again(stage, races, seed, place)
+    tally = Tally()
+    for stage in on_each_backend(place, tally):
+        _race_again_and_again(stage, races, random.Random(seed), place, tally)
+    return tally.result()
 
 
-def _race_again_and_again(stage: Stage, races: int, seed: int, place: Path) -> Result:
-    rng, tally = random.Random(seed), Tally()
-    chain = stage.chain(place / "run", tally)
-    while tally.tried < races:
+def _race_again_and_again(
+    stage: Stage, races: int, rng: random.Random, place: Path, tally: Tally
+) -> None:
+    chain, end = stage.chain(place / "run", tally), tally.tried + races
+    while tally.tried < end:
         arguments = ["resume", str(chain.run)]
         if rng.random() < 0.33 or not (chain.run / "config.json").exists():
             chain = stage.chain(place / "run", tally)  # in an empty folder
-            arguments = train_arguments(chain.run, steps=stage.reference.steps)
+            arguments = stage.reference.arguments(chain.run)
         _race(stage.nursery, arguments, chain, tally, rng.uniform(0.0, 0.8))
     shutil.rmtree(chain.run)
-    return tally.result()
 
 
 def _race(nursery: Nursery, arguments: list[str], chain: Chain, tally: Tally, more: float) -> None:
@@ -83,4 +86,6 @@ def _check_told(loser: Process, winner: Process, what: str, tally: Tally) -> Non
 
 @pytest.mark.slow
 def test_one_gets_the_run_and_the_others_are_told(stage: Stage, tmp_path: Path) -> None:
-    assert_held(_race_again_and_again(stage, 3, 6, tmp_path), 3)
+    tally = Tally()
+    _race_again_and_again(stage, 3, random.Random(6), tmp_path, tally)
+    assert_held(tally.result(), 3)

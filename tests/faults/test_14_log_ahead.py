@@ -7,7 +7,7 @@ import shutil
 import time
 from pathlib import Path
 
-from faults.canned import Ended, Trap, go, played_back, record, until
+from faults.canned import BACKENDS, Ended, Trap, go, played_back, record, until
 from faults.disk import Disk, Op, Tree, make_tree
 from faults.result import Result, Tally, assert_held
 from sauna import rundir
@@ -17,33 +17,41 @@ from sauna.errors import SaunaError
 def experiment(least: int, seed: int, place: Path) -> Result:
     """A run is cut off before each of its file operations: killed there, or without power.
 
-    `worst`: seconds of the slowest resume.
+    On each backend. `worst`: seconds of the slowest resume.
     """
-    rng, tally = random.Random(seed), Tally()
-    with played_back(record()):
+    tally = Tally()
+    for backend in BACKENDS:
+        _cut_off_everywhere(backend, least, random.Random(seed), place, tally)
+    return tally.result()
+
+
+def _cut_off_everywhere(
+    backend: str, least: int, rng: random.Random, place: Path, tally: Tally
+) -> None:
+    world = BACKENDS[backend]
+    with played_back(record(world)):
         whole = Trap()
-        until(place / "whole", whole)
-        expected = Ended(place / "whole")
+        until(place / backend, whole, world)
+        expected = Ended(place / backend)
         count = len(whole.ops)
         points = range(count) if least >= count else sorted(rng.sample(range(count), least // 2))
-        tally.notes["file operations of a run"] = count
+        tally.count(f"file operations of a run on the {backend}", count)
         for at in points:
-            _kill(place / "run", at, expected, tally)
+            _kill(place / "run", world, at, expected, tally)
         for at, tree in _power_cuts(whole.ops, points, rng):
             shutil.rmtree(place / "run", ignore_errors=True)
             make_tree(tree, place / "run")
             tally.count("power cuts")
-            _go_on(place / "run", f"power cut before operation {at}", expected, tally)
-    return tally.result()
+            _go_on(place / "run", world, f"power cut before operation {at}", expected, tally)
 
 
-def _kill(run: Path, at: int, expected: Ended, tally: Tally) -> None:
+def _kill(run: Path, world: str, at: int, expected: Ended, tally: Tally) -> None:
     shutil.rmtree(run, ignore_errors=True)
-    until(run, Trap(at))
+    until(run, Trap(at), world)
     tally.count("kills")
     if rundir.rows(run) and not (run / "checkpoints").exists():
         tally.count("rows, but no checkpoint yet")
-    _go_on(run, f"killed before operation {at}", expected, tally)
+    _go_on(run, world, f"killed before operation {at}", expected, tally)
 
 
 def _power_cuts(ops: list[Op], points: object, rng: random.Random) -> list[tuple[int, Tree]]:
@@ -56,11 +64,11 @@ def _power_cuts(ops: list[Op], points: object, rng: random.Random) -> list[tuple
     return found
 
 
-def _go_on(run: Path, what: str, expected: Ended, tally: Tally) -> None:
+def _go_on(run: Path, world: str, what: str, expected: Ended, tally: Tally) -> None:
     tally.tried += 1
     clock = time.monotonic()
     try:
-        go(run)
+        go(run, world)
     except SaunaError as error:
         tally.lose(f"{what}: {error}")
         return
@@ -73,4 +81,6 @@ def _go_on(run: Path, what: str, expected: Ended, tally: Tally) -> None:
 
 
 def test_cut_off_anywhere_no_row_is_lost_or_there_twice(tmp_path: Path) -> None:
-    assert_held(experiment(30, 4, tmp_path), 30)
+    tally = Tally()
+    _cut_off_everywhere("host", 30, random.Random(4), tmp_path, tally)
+    assert_held(tally.result(), 30)
