@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import random
 import signal
 import time
 from pathlib import Path
 
+import pytest
+
 from faults.chain import (
+    BACKENDS,
+    PATIENCE,
+    SETTINGS,
     Chain,
     Stage,
     children,
@@ -18,6 +24,7 @@ from faults.chain import (
     wait_for_rows,
     wait_until,
 )
+from faults.nursery import Started
 from faults.result import Result, Tally, assert_held
 
 AIMS = ("save", "save", "rows", "start")
@@ -79,6 +86,39 @@ def _kill(chain: Chain, rng: random.Random, tally: Tally, fresh: bool) -> bool:
         tally.lose("a worker outlived its coordinator")
     chain.judge(f"kill {tally.tried} (aimed at {aim})")
     return True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_comparison_that_is_killed_goes_on_to_the_same_bytes(
+    backend: str, tmp_path: Path
+) -> None:
+    """Its runs notice, save and end by themselves; the same command continues them."""
+    env, own = BACKENDS[backend]
+    settings = {**SETTINGS, **own, "steps": 32 * 400}
+    del settings["arm"]
+    command = ["compare", env, "--arms=ppo,sauna", *(f"--{k}={v}" for k, v in settings.items())]
+
+    def start(out: Path) -> Started:
+        return Started([*command, "--out", str(out)], out.with_suffix(".log"))
+
+    def logs(out: Path) -> dict[str, bytes]:
+        found = (out / "units").rglob("metrics.jsonl")
+        return {str(path.relative_to(out)): path.read_bytes() for path in found}
+
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert start(whole).wait(PATIENCE) == 0
+    for least in (1, 20_000):
+        process = start(killed)
+        wait_until(lambda: sum(map(len, logs(killed).values())) >= least, process, PATIENCE, 0.01)  # noqa: B023
+        process.kill()
+        assert process.wait(30.0) == -signal.SIGKILL
+    process = start(killed)
+    assert process.wait(PATIENCE) == 0, process.said()
+    assert logs(killed) == logs(whole) and len(logs(whole)) == 2
+    name = next(path.name for path in whole.iterdir() if path.name.startswith("compare_"))
+    table = [json.loads((o / name / "summary.json").read_text())["table"] for o in (whole, killed)]
+    assert table[0] == table[1]
 
 
 def test_killed_at_any_moment_it_goes_on_to_the_same_bytes(stage: Stage, tmp_path: Path) -> None:
