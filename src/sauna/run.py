@@ -237,9 +237,10 @@ def settle(config: Config, spaces: Spaces) -> Config:
     number = len(config.arm) * len(config.seeds)
     processes = config.processes or os.cpu_count() or 1
     together = config.device == "gpu" or config.devices > 1 or config.distributed
-    if config.devices > 1:
+    on_device = config.backend == "device"
+    if on_device and config.devices > 1:
         check_shared("devices", number, config.envs, config.devices)
-    if config.backend == "device" and together:
+    if on_device and together:
         processes = 1  # one program for all members and all devices
     return dataclasses.replace(
         config,

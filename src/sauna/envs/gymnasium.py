@@ -87,9 +87,12 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
     """One environment, or a `BadInput` that says why it cannot be made."""
     maker = env_maker(env, env_kwargs)
     try:
-        return maker(**more)
+        made = maker(**more)
     except Exception as error:  # whatever a user's environment raises when made
         raise BadInput(f"env: {env} cannot be made: {one_line(error)}") from error
+    if not hasattr(made, "observation_space"):
+        raise BadInput(f"env: {env} gives no environment, but {type(made).__name__}")
+    return made
 
 
 class Slot:

@@ -48,12 +48,54 @@ def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
     """The spaces of an environment on the device, which repeats itself by construction.
 
     Raises:
-      BadInput: the environment cannot be made, or its spaces are not supported.
+      BadInput: the environment cannot be made, its spaces are not supported, or it is a user's own
+        and cannot be compiled.
     """
     from sauna.envs.jax_native import make_jax_env
 
     made = make_jax_env(env, env_kwargs)
-    return Probe(describe(made.observation_space, made.action_space), None)
+    spaces = describe(made.observation_space, made.action_space)
+    if ":" in env:
+        _check_traced(env, made, spaces)
+    return Probe(spaces, None)
+
+
+def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
+    """Traces a reset and a step, which compiles and computes nothing.
+
+    Raises:
+      BadInput: they raise, or give other arrays than `JaxEnv` says.
+    """
+    import jax
+
+    from sauna.envs.jax_env import flat
+
+    one = flat(made)
+    action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
+    try:
+        state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))
+        told = jax.eval_shape(one.step, state, action)
+    except Exception as error:  # whatever a user's environment raises when traced
+        raise BadInput(f"env: {env} cannot be played: {one_line(error)}") from error
+    once = {
+        "observation": spaces.observation_shape,
+        "reward": (),
+        "terminated": (),
+        "truncated": (),
+    }
+    for name, shape in once.items():
+        if getattr(told, name).shape != shape or (name == "observation" and first.shape != shape):
+            raise BadInput(f"env: {env}: its {name} is not of shape {shape}")
+    if _arrays(told.state) != _arrays(state):
+        raise BadInput(f"env: {env}: its state has other arrays after a step than after a reset")
+
+
+def _arrays(tree: Any) -> Any:
+    """The structure of a pytree, and its leaves' shapes and types."""
+    import jax
+
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]
 
 
 def _play(env: Any, seed: int) -> list[tuple[np.ndarray, float, bool]]:
