@@ -141,5 +141,25 @@ def unlucky() -> JaxEnv:
     return poisoned(Poison(jax.random.fold_in(own, 3), FIELDS.index("reward"), jnp.nan, 0, 2))
 
 
+def faulty(fault: str) -> JaxEnv:
+    """A beginner's environment."""
+
+    def play(state: State, action: jax.Array) -> Transition:
+        told = step(state, action)
+        if fault == "raises":
+            raise ValueError("two\nlines")
+        if fault == "branches" and told.terminated:
+            return told
+        other = {
+            "observation": jnp.zeros(3),
+            "reward": jnp.ones(1),
+            "terminated": jnp.zeros(2, bool),
+        }
+        after = {"state": State(told.state.x, jnp.float32(told.state.steps), told.state.key)}
+        return told._replace(**{k: v for k, v in {**other, **after}.items() if k == fault})
+
+    return walk._replace(step=play)
+
+
 def no_env(**kwargs: Any) -> int:
     return 3

@@ -32,6 +32,7 @@ class Mistake(NamedTuple):
     arguments: list[str]
     said: str
     text: str = ""
+    imports: bool = False  # it takes JAX and its environments to know, whose import takes seconds
 
 
 def typo(word: str, rng: random.Random) -> str:
@@ -191,10 +192,49 @@ def wrong_study(rng: random.Random) -> Mistake:
     ])  # fmt: skip
 
 
+def wrong_on_device(rng: random.Random) -> Mistake:
+    walk, pole = "jax_worlds:walk", "gymnax/CartPole-v1"
+    fault = rng.choice(["raises", "branches", "observation", "reward", "terminated", "state"])
+    faulty = ["train", "jax_worlds:faulty", "--env-kwargs", f'{{"fault": "{fault}"}}']
+    said = {"raises": "cannot be played: ValueError: two lines",
+            "branches": "cannot be played: TracerBool",
+            "state": "its state has other arrays"}  # fmt: skip
+    import jax_worlds
+
+    del jax_worlds
+    only, count = "only read with backend device", rng.randrange(1, 9)
+    at_once = [
+        Mistake(["train", WORLD, f"--device={rng.choice(['cpu', 'auto'])}"], f"device: {only}"),
+        Mistake(["train", WORLD, f"--devices={count}"], f"devices: {only}"),
+        Mistake(["train", WORLD, "--reset=cached"], f"reset: {only}"),
+        Mistake(["train", WORLD, "--distributed=here:1,2,0"], f"distributed: {only}"),
+        Mistake(["compare", WORLD, f"--devices={count}"], f"devices: {only}"),
+        Mistake(["train", pole, f"--env-processes={count}", "--seeds=9"], "env_processes: not"),
+        Mistake(["compare", pole, "--env-processes=1"], "env_processes: not read"),
+        Mistake(["train", pole, "--distributed=here"], "distributed: 'here' is not HOST:PORT,"),
+        Mistake(["train", pole, f"--distributed=a:1,{count},{count}"], "distributed: index"),
+        Mistake(["train", pole, "--distributed=a:1,2,0", f"--devices={count}"], "devices: not"),
+        Mistake(["train", pole, f"--steps={rng.randrange(3, 9)}e9"], "steps: the device counts"),
+    ]
+    after_imports = [
+        Mistake(["train", walk, "--env-processes=1"], "env_processes: not read"),
+        Mistake(["train", WORLD, "--backend=device"], "backend: worlds:Scripted is not"),
+        Mistake(["train", "CartPole-v1", "--backend=device"], "backend: CartPole-v1 has no face"),
+        Mistake(["train", walk, "--devices=2"], "devices: 1 members of 1 environments cannot be"),
+        Mistake(["train", f"jax_worlds:{typo('unlucky', rng)}"], "did you mean 'unlucky'?"),
+        Mistake(["train", walk, "--network=nature-cnn"], "network: nature-cnn does not fit"),
+        Mistake(["train", walk, "--env-kwargs", '{"speed": 1}'], "env_kwargs: jax_worlds:walk"),
+        Mistake(["train", "jax_worlds:no_env"], "gives no environment, but int"),
+        Mistake(["train", "jax_worlds:no_env", "--backend=device"], "is not a sauna.JaxEnv"),
+        Mistake(faulty, said.get(fault, f"its {fault} is not of shape")),
+    ]
+    return rng.choice([*at_once, *(mistake._replace(imports=True) for mistake in after_imports)])
+
+
 KINDS: list[Callable[[random.Random], Mistake]] = [
     wrong_flag, out_of_bounds, unreadable, unknown_choice, unknown_name, unread_setting,
     impossible_together, wrong_environment, wrong_command, wrong_run, wrong_config_file,
-    wrong_study,
+    wrong_study, wrong_on_device,
 ]  # fmt: skip
 
 
@@ -211,7 +251,7 @@ def experiment(least: int, seed: int, place: Path) -> Result:
             file.write_text(mistake.text)
             arguments = [part.replace("{file}", str(file)) for part in mistake.arguments]
             os.chdir(folder)
-            ask = _in_a_process if number % 30 == 29 else _here
+            ask = _in_a_process if number % 30 == 29 and not mistake.imports else _here
             _judge(arguments, mistake.said, ask, folder, tally)
     finally:
         os.chdir(before)
