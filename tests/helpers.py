@@ -66,6 +66,8 @@ def make_job(env: str, chosen: list[int] | None = None, **settings: Any) -> Job:
     given = {"env": env, "processes": 1, **SMALL, **settings}
     if "network" in settings:
         del given["hidden"]  # which only the MLP reads
+    if settings.get("algorithm") == "a2c":
+        del given["minibatches"], given["epochs"]  # which only PPO reads
     config = placed(resolve(given))
     found = look_at(config)
     config = settle(config, found.spaces)

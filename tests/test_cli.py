@@ -222,7 +222,7 @@ def test_presets_are_the_published_numbers() -> None:
     assert changed == {"preset", "envs", "rollout_steps", "minibatches", "epochs"}
     assert (flagrun.rollout_steps, flagrun.envs, flagrun.epochs) == (512, 32, 15)
     assert flagrun.rollout_steps * flagrun.envs // flagrun.minibatches == 4096
-    assert set(PRESETS) == {"mujoco", "mujoco-release", "flagrun"}
+    assert set(PRESETS) == {"mujoco", "mujoco-release", "flagrun", "a2c", "a2c-mujoco"}
 
 
 def test_arms_are_the_options_table() -> None:

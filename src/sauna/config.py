@@ -62,7 +62,12 @@ class Config:
     arm: tuple[str, ...] = option(
         ("sauna",), "what to train, a name or several: see `sauna list arms`", shapes_program=False
     )
-    preset: str = option("mujoco", "PPO settings to start from", shapes_program=False)
+    algorithm: str = option(
+        "ppo", "how the policy is improved: by PPO, or by A2C", choices=("ppo", "a2c")
+    )
+    preset: str = option(
+        "mujoco", "settings to start from; with A2C, preset a2c", shapes_program=False
+    )
     seeds: tuple[int, ...] = option(
         (0,), "how many seeds (6: seeds 0 to 5), or which ones (100,101,110)", shapes_program=False
     )
@@ -121,11 +126,16 @@ class Config:
     rollout_steps: int = option(2048, "kept steps per environment and iteration (T)", at_least=1)
     minibatches: int = option(32, "minibatches per epoch", at_least=1)
     epochs: int = option(10, "passes over each rollout", at_least=1)
-    learning_rate: float = option(3e-4, "Adam's step size", above=0, shapes_program=False)
+    learning_rate: float = option(3e-4, "the optimizer's step size", above=0, shapes_program=False)
     learning_rate_schedule: str = option(
         "linear", "over the budget of steps: to 0, or constant", choices=("linear", "constant")
     )
+    optimizer: str = option("adam", "what scales the gradient", choices=("adam", "rmsprop"))
     adam_epsilon: float = option(1e-5, "Adam's epsilon", above=0)
+    rmsprop_epsilon: float = option(1e-5, "RMSProp's epsilon, under the root", above=0)
+    rmsprop_decay: float = option(
+        0.99, "of RMSProp's running mean square", at_least=0, at_most=0.999999
+    )
     max_grad_norm: float = option(
         0.5, "the gradient is scaled down to this global norm", above=0, shapes_program=False
     )
@@ -315,6 +325,11 @@ def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:
 # What reads a field that not every run reads. A field named by the user that nothing reads is
 # refused, so that no setting is silently without effect.
 _READERS: dict[str, tuple[str, Any]] = {
+    **dict.fromkeys(("minibatches", "epochs", "clip_range", "clip_value"),
+                    ("algorithm ppo", lambda c: c.algorithm == "ppo")),
+    "adam_epsilon": ("optimizer adam", lambda c: c.optimizer == "adam"),
+    **dict.fromkeys(("rmsprop_epsilon", "rmsprop_decay"),
+                    ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")),
     "threshold": ("a filter other than none and random-drop",
                   lambda c: c.filter not in ("none", "random-drop")),
     "history": ("filter sauna", lambda c: c.filter == "sauna"),

@@ -86,7 +86,7 @@ def make_parts(config: Config, spaces: Spaces, env: JaxEnv, anywhere: Any) -> Pa
 
 def init_member(parts: Parts, setting: Setting) -> MemberState:
     zero = jnp.int32(0)
-    learner = init_state(parts.policy, setting.keys.init)
+    learner = init_state(parts.config, parts.policy, setting.keys.init)
     return MemberState(learner, start(parts.collecting, setting.keys.env), zero, zero)
 
 

@@ -36,7 +36,15 @@ from sauna.envs.jax_env import flat
 from sauna.envs.jax_native import make_jax_env
 from sauna.errors import BadInput
 from sauna.machines import check_shared, join, read_place, same, share, tell
-from sauna.member_state import Counters, fitting, flat_params, named_params, under, unpack_adam
+from sauna.member_state import (
+    Counters,
+    fitting,
+    flat_params,
+    named_optimizer,
+    named_params,
+    under,
+    unpack_optimizer,
+)
 from sauna.metrics.rows import metrics_row
 from sauna.presets import Member
 from sauna.rundir import versions
@@ -211,9 +219,9 @@ def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
 
 
 def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arrays:
-    learner, adam = state.learner, state.learner.optimizer
+    learner = state.learner
     arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
-    arrays |= {"adam/count": adam.count, "adam/mean": adam.mu, "adam/variance": adam.nu}
+    arrays |= named_optimizer(learner)
     arrays |= counters.to_arrays()
     moments = state.collect.observation_moments
     if isinstance(moments, Moments):  # where a trained policy looks for them, and as the host's
@@ -260,11 +268,11 @@ def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray])
     for member, example in zip(job.members, population.states(), strict=True):
         own = under(member.name + "/", arrays)
         counted = Counters.from_arrays(own)
-        adam = unpack_adam(own, example.learner)
+        optimizer = unpack_optimizer(own, example.learner)
         params = flat_params(population.policy, example.learner.params, under("params/", own))
         states.append(
             MemberState(
-                TrainState(params, adam),
+                TrainState(params, optimizer),
                 filled(example.collect, under("collect/", own)),
                 jnp.int32(counted.env_steps),
                 jnp.int32(counted.kept_steps),

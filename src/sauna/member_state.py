@@ -113,9 +113,7 @@ def pack_member(
 ) -> dict[str, np.ndarray]:
     """Member `p`'s state, every name starting with the member's."""
     arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
-    arrays["adam/count"] = np.asarray(state.optimizer.count)
-    arrays["adam/mean"] = np.asarray(state.optimizer.mu)
-    arrays["adam/variance"] = np.asarray(state.optimizer.nu)
+    arrays |= named_optimizer(state)
     arrays |= counters.to_arrays()
     for key, value in (moments_of(collector, p) | collected_of(collector, p)).items():
         arrays[key] = value
@@ -126,16 +124,28 @@ def pack_member(
     return {f"{name}/{key}": np.array(value) for key, value in arrays.items()}
 
 
-def unpack_adam(own: Mapping[str, np.ndarray], example: TrainState) -> optax.ScaleByAdamState:
-    """The optimiser's state.
+def named_optimizer(state: TrainState) -> dict[str, np.ndarray]:
+    """The optimizer's state as arrays, in its own order."""
+    optimizer = state.optimizer
+    if isinstance(optimizer, optax.ScaleByRmsState):
+        named = {"rmsprop/mean_square": optimizer.nu}
+    else:
+        named = {"adam/count": optimizer.count, "adam/mean": optimizer.mu,
+                 "adam/variance": optimizer.nu}  # fmt: skip
+    return {name: np.asarray(array) for name, array in named.items()}
+
+
+def unpack_optimizer(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
+    """The inverse of `named_optimizer`.
 
     Raises:
       BadCheckpoint: an array is missing, or of another shape or type.
     """
-    like = example.optimizer
-    names = {"adam/count": like.count, "adam/mean": like.mu, "adam/variance": like.nu}
-    return optax.ScaleByAdamState(
-        *(jnp.asarray(fitting(own, name, place)) for name, place in names.items())
+    return type(example.optimizer)(
+        *(
+            jnp.asarray(fitting(own, name, place))
+            for name, place in named_optimizer(example).items()
+        )
     )
 
 
@@ -157,8 +167,8 @@ def unpack_member(
       NotRestored: a replayed environment shows another observation than the stored one.
     """
     own = under(name + "/", arrays)
-    adam = unpack_adam(own, example)
-    state = TrainState(flat_params(policy, example.params, under("params/", own)), adam)
+    params = flat_params(policy, example.params, under("params/", own))
+    state = TrainState(params, unpack_optimizer(own, example))
     counters = Counters.from_arrays(own)
     for key, place in moments_of(collector, p).items():
         place[...] = fitting(own, key, place)

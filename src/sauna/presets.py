@@ -1,6 +1,6 @@
-"""Named settings: PPO presets, arms (which selection method), and how a run's config is resolved.
+"""Named settings: presets, arms (which selection method), and how a run's config is resolved.
 
-A preset says how PPO trains; an arm says which transitions the update keeps. METHOD, in
+A preset says how an algorithm trains; an arm says which transitions the update keeps. METHOD, in
 `docs/algorithm.md`, gives the origin of every number.
 """
 
@@ -22,12 +22,34 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Their log-std was annealed and their step size followed the KL divergence; here the log-std
     # is learned and the step size falls linearly, as everywhere else.
     "flagrun": {"envs": 32, "rollout_steps": 512, "minibatches": 4, "epochs": 15},
+    # Mnih et al. (2016) in its synchronous form, with OpenAI baselines' defaults (`a2c.py`).
+    # Lambda 1 makes n-step returns. A checkpoint comes after as many env steps as with PPO.
+    "a2c": {
+        "algorithm": "a2c",
+        "envs": 16,
+        "rollout_steps": 5,
+        "minibatches": 1,
+        "epochs": 1,
+        "learning_rate": 7e-4,
+        "optimizer": "rmsprop",
+        "normalize_advantages": False,
+        "entropy_coef": 0.01,
+        "gae_lambda": 1.0,
+        "trunk": "shared",
+        "checkpoint_every": 1280,
+    },
 }
+PRESETS["a2c-mujoco"] = {**PRESETS["a2c"], "entropy_coef": 0.0, "trunk": "separate"}
+
+# The preset of an algorithm where none is named.
+FIRST = {"ppo": "mujoco", "a2c": "a2c"}
 
 PRESET_HELP = {
     "mujoco": "PPO on MuJoCo as published (Schulman et al. 2017, OpenAI baselines)",
     "mujoco-release": "the same as the SAUNA authors ran it: 15 epochs, constant learning rate",
     "flagrun": "PPO on HumanoidFlagrunHarder: 32 actors, 512 steps each, minibatches of 4096",
+    "a2c": "A2C as published (Mnih et al. 2016, OpenAI baselines): 16 actors, 5 steps each",
+    "a2c-mujoco": "the same for continuous control: separate trunks, no entropy bonus",
 }
 
 ARMS: dict[str, dict[str, Any]] = {
@@ -50,7 +72,7 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 
 ARM_HELP = {
-    "ppo": "PPO alone: no Vex loss, nothing dropped",
+    "ppo": "PPO (or A2C) alone: no Vex loss, nothing dropped",
     "vex-head": "the Vex head is trained, nothing is dropped",
     "random-drop": "as SAUNA, but drops at random at a given rate (a control)",
     "sauna": "the corrected method: every state has its own Vex target",
@@ -94,7 +116,7 @@ def resolve(given: Mapping[str, Any]) -> Config:
     parsed = parse_all(given)
     arms = parsed.get("arm", FIELDS["arm"].default)
     _check_arms(arms, parsed)
-    configs = [_arm_config(arm, parsed) for arm in arms]
+    configs = [arm_config(arm, parsed) for arm in arms]
     check_read(configs, parsed)
     shared = next((config for config in configs if config.filter != "none"), configs[0])
     for arm, config in zip(arms, configs, strict=True):
@@ -131,24 +153,45 @@ def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
     for arm in arms:
         if arm not in ARMS:
             raise BadInput(f"unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
-    preset = parsed.get("preset", FIELDS["preset"].default)
-    if preset not in PRESETS:
-        known = ", ".join(PRESETS)
-        raise BadInput(f"unknown preset {preset!r} (known: {known}){nearest(preset, PRESETS)}")
+    chosen_preset(parsed)
     for name in parsed:
         if all(name in FIXED.get(arm, ()) for arm in arms):
             raise BadInput(f"{name}: fixed by arm {', '.join(arms)}; `--arm sauna` lets you set it")
 
 
-def _arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
-    preset = parsed.get("preset", FIELDS["preset"].default)
+def chosen_preset(parsed: Mapping[str, Any]) -> str:
+    """The preset that is named, or the first one of the algorithm.
+
+    Raises:
+      BadInput: there is no such preset, or it is another algorithm's than the one named.
+    """
+    algorithm = parsed.get("algorithm")
+    preset = parsed.get("preset", FIRST[algorithm or Config.algorithm])
+    if preset not in PRESETS:
+        known = ", ".join(PRESETS)
+        raise BadInput(f"unknown preset {preset!r} (known: {known}){nearest(preset, PRESETS)}")
+    if algorithm is not None and algorithm_of(preset) != algorithm:
+        known = ", ".join(name for name in PRESETS if algorithm_of(name) == algorithm)
+        raise BadInput(f"preset: {preset} is not one of {algorithm}'s ({known})")
+    return preset
+
+
+def algorithm_of(preset: str) -> str:
+    """The algorithm that a preset is for."""
+    return str(PRESETS[preset].get("algorithm", Config.algorithm))
+
+
+def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
+    """Defaults < preset < arm < what the user gave and the arm does not fix; not checked."""
+    preset = chosen_preset(parsed)
     own = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
-    return dataclasses.replace(Config(), **{**PRESETS[preset], **ARMS[arm], **own})
+    settings = {**PRESETS[preset], **ARMS[arm], **own, "preset": preset}
+    return dataclasses.replace(Config(), **settings)
 
 
 def _member_config(arm: str, parsed: Mapping[str, Any], shared: Config) -> Config:
     """An arm's own traced values on the shared program; filter off is threshold 0."""
-    own = _arm_config(arm, parsed)
+    own = arm_config(arm, parsed)
     off = own.filter == "none" and shared.filter != "none"
     rules = {name: getattr(shared, name) for name in _SHARED_RULES}
     return dataclasses.replace(own, **rules, threshold=0.0 if off else own.threshold)

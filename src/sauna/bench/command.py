@@ -17,6 +17,7 @@ from sauna import rundir
 from sauna.bench.peers import peer_rate, prepare, versions
 from sauna.bench.rates import WARM_UP, alternate, physics_rate, ratio, training_rate
 from sauna.bench.scale import scale
+from sauna.errors import BadInput
 from sauna.presets import resolve
 from sauna.run import plain
 
@@ -68,8 +69,12 @@ def bench(
         "git": rundir.git_revision(),
     }
     if against:
+        if script and config.algorithm != "ppo":
+            raise BadInput(f"against: {against} is run with PPO, not with {config.algorithm}")
         python = prepare(against, say)
-        measures[against] = partial(peer_rate, python, script, config.env, processes, SECONDS)
+        measures[against] = partial(
+            peer_rate, python, script, config.env, config.algorithm, processes, SECONDS
+        )
         result["peer"] = {"name": against, "processes": processes, "versions": versions(python)}
     result["rates"] = rates = alternate(measures, rounds, say)
     result["ratios"] = {

@@ -91,6 +91,8 @@ def _check_peer(config: Config) -> None:
     Raises:
       BadInput: naming the field.
     """
+    if config.algorithm != "ppo":
+        raise BadInput(f"against: brax is run with PPO, not with {config.algorithm}")
     if config.env.split("/")[0] not in ("brax", "playground"):
         raise BadInput(f"against: brax cannot train {config.env}")
     if len(config.seeds) * len(config.arm) > 1:

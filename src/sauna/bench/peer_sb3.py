@@ -1,7 +1,7 @@
-"""Stable-Baselines3's PPO with this project's `mujoco` preset; prints its env steps per second.
+"""Stable-Baselines3's PPO or A2C with our preset `mujoco` or `a2c-mujoco`; prints its rate.
 
-Run by an interpreter of its own environment, with the environment id, seed and seconds as
-arguments. The rate is that of whole rollouts and updates, after the first two.
+Run by an interpreter of its own environment, with the environment id, seed, seconds and the
+algorithm as arguments. The rate is that of whole rollouts and updates, after the first two.
 """
 
 import json
@@ -10,12 +10,12 @@ import time
 
 import gymnasium
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-env_id, seed, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+env_id, seed, seconds, algorithm = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), sys.argv[4]
 torch.set_num_threads(1)
 
 
@@ -33,12 +33,17 @@ class Clock(BaseCallback):
         return len(self.seen) < 5 or time.perf_counter() - self.seen[2][0] < seconds
 
 
-env = VecNormalize(DummyVecEnv([lambda: Monitor(gymnasium.make(env_id))]), gamma=0.99)
-model = PPO(
-    "MlpPolicy", env, seed=seed, n_steps=2048, batch_size=64, n_epochs=10, clip_range=0.2,
-    clip_range_vf=0.2, vf_coef=0.5, ent_coef=0.0, max_grad_norm=0.5, gamma=0.99, gae_lambda=0.95,
-    learning_rate=lambda left: 3e-4 * left, device="cpu",
-)  # fmt: skip
+number = 1 if algorithm == "ppo" else 16
+env = VecNormalize(DummyVecEnv([lambda: Monitor(gymnasium.make(env_id))] * number), gamma=0.99)
+common = {"seed": seed, "vf_coef": 0.5, "ent_coef": 0.0, "max_grad_norm": 0.5, "gamma": 0.99,
+          "device": "cpu"}  # fmt: skip
+if algorithm == "ppo":
+    model = PPO(
+        "MlpPolicy", env, n_steps=2048, batch_size=64, n_epochs=10, clip_range=0.2,
+        clip_range_vf=0.2, gae_lambda=0.95, learning_rate=lambda left: 3e-4 * left, **common,
+    )  # fmt: skip
+else:
+    model = A2C("MlpPolicy", env, n_steps=5, learning_rate=lambda left: 7e-4 * left, **common)
 clock = Clock()
 model.learn(100_000_000, callback=clock)
 (first, before), (last, after) = clock.seen[2], clock.seen[-1]

@@ -70,16 +70,19 @@ def _pip(python: Path, arguments: list[str]) -> str | None:
     return None if done.returncode == 0 else lines[-1]
 
 
-def peer_rate(python: Path, script: Path | None, env: str, processes: int, seconds: float) -> float:
+def peer_rate(
+    python: Path, script: Path | None, env: str, algorithm: str, processes: int, seconds: float
+) -> float:
     """Env steps per second, summed over `processes` trainings that run at the same time.
 
     Args:
       script: CleanRL's `ppo_continuous_action.py`, or None for Stable-Baselines3.
+      algorithm: of Stable-Baselines3.
 
     Raises:
       SaunaError: one of them failed; its last line says why.
     """
-    measure = _sb3 if script is None else partial(_cleanrl, script)
+    measure = partial(_sb3, algorithm) if script is None else partial(_cleanrl, script)
     with ThreadPoolExecutor(processes) as pool:
         rates = pool.map(lambda seed: measure(python, env, seed, seconds), range(processes))
         return sum(rates)
@@ -91,9 +94,9 @@ def _variables() -> dict[str, str]:
     return variables
 
 
-def _sb3(python: Path, env: str, seed: int, seconds: float) -> float:
+def _sb3(algorithm: str, python: Path, env: str, seed: int, seconds: float) -> float:
     script = Path(__file__).with_name("peer_sb3.py")
-    command = [str(python), str(script), env, str(seed), str(seconds)]
+    command = [str(python), str(script), env, str(seed), str(seconds), algorithm]
     with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it is started
         done = subprocess.run(command, capture_output=True, text=True, env=_variables(), cwd=folder)
     if done.returncode:

@@ -1,4 +1,4 @@
-"""The objective of eq. 6: clipped surrogate, value loss, entropy and Vex loss.
+"""The objective of eq. 6: clipped surrogate, value loss, entropy and Vex loss. A2C's: `a2c.py`.
 
 All means are weighted: a slot with weight 0 (left empty, or masked by the filter) counts for
 nothing. With every weight 1 they are plain means.
@@ -14,7 +14,7 @@ from sauna.core.types import Array, Hypers
 
 
 class Losses(NamedTuple):
-    """Scalars of one minibatch."""
+    """Scalars of one minibatch; NaN where an algorithm has no such number."""
 
     total: Array
     policy_loss: Array
@@ -55,6 +55,14 @@ def value_error(value: Array, old: Array, return_: Array, clip_range: Array | No
     return 0.5 * error
 
 
+def weigh(
+    policy_loss: Array, value_loss: Array, vex_loss: Array, entropy: Array, hypers: Hypers
+) -> Array:
+    """The total of eq. 6: `policy - c_ent * entropy + c1 * value + c2 * vex`."""
+    total = policy_loss - hypers.entropy_coef * entropy
+    return total + hypers.value_coef * value_loss + hypers.vex_coef * vex_loss
+
+
 def combine(
     log_ratio: Array,
     advantage: Array,
@@ -64,7 +72,7 @@ def combine(
     weight: Array,
     hypers: Hypers,
 ) -> Losses:
-    """`policy - c_ent * entropy + c1 * value + c2 * vex` and what is logged beside it.
+    """PPO's losses, their total and what is logged beside it.
 
     The KL estimate is `mean((r - 1) - log r)` (Schulman's k3), of new against old policy.
     """
@@ -74,8 +82,7 @@ def combine(
     value_loss = weighted_mean(value_errors, weight)
     vex_loss = weighted_mean(vex_error, weight)
     mean_entropy = weighted_mean(entropy, weight)
-    total = policy_loss - hypers.entropy_coef * mean_entropy
-    total = total + hypers.value_coef * value_loss + hypers.vex_coef * vex_loss
+    total = weigh(policy_loss, value_loss, vex_loss, mean_entropy, hypers)
     kl = weighted_mean((ratio - 1.0) - log_ratio, weight)
     outside = (jnp.abs(ratio - 1.0) > hypers.clip_range).astype(ratio.dtype)
     return Losses(

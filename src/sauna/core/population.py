@@ -57,7 +57,7 @@ def make_program(config: Config, spaces: Spaces) -> Program:
         config=config,
         policy=policy,
         filter=filter,
-        init=jax.jit(partial(init_state, policy)),
+        init=jax.jit(partial(init_state, config, policy)),
         draw=jax.jit(partial(draw_noise, policy, config)),
         act=jax.jit(map_members(partial(act, policy))),
         score=jax.jit(partial(score, policy)),

@@ -62,10 +62,10 @@ class Batch(NamedTuple):
 
 
 class TrainState(NamedTuple):
-    """What learning changes. Parameters are one flat vector, so that Adam is a few vector ops."""
+    """What learning changes. Parameters are one flat vector, so that a step is a few vector ops."""
 
     params: Array  # [D] float32, the raveled parameter pytree
-    optimizer: Any  # optax.ScaleByAdamState: count int32, mu [D], nu [D]
+    optimizer: Any  # optax's ScaleByAdamState (count int32, mu [D], nu [D]) or ScaleByRmsState
 
 
 class PolicyOutput(NamedTuple):

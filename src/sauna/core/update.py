@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optax
 
 from sauna.config import Config
+from sauna.core import a2c
 from sauna.core.losses import Losses, combine, standardize, value_error, weighted_mean
 from sauna.core.policy import Policy
 from sauna.core.types import Array, Batch, Hypers, Rollout, TrainState
@@ -16,7 +17,10 @@ from sauna.selection.vex import VexTarget
 
 
 class UpdateMetrics(NamedTuple):
-    """Scalars of one iteration. Losses are means over all minibatches."""
+    """Scalars of one iteration. Losses are means over all minibatches.
+
+    What an algorithm or a rollout does not have is NaN.
+    """
 
     policy_loss: Array
     value_loss: Array
@@ -33,17 +37,27 @@ class UpdateMetrics(NamedTuple):
     finite: Array  # bool: parameters and losses are finite
 
 
+def scaling(config: Config) -> optax.GradientTransformation:
+    """Adam or RMSProp without the step size (which is traced).
+
+    RMSProp is TensorFlow's, as in baselines: the mean square starts at 1, epsilon is under the
+    root.
+    """
+    if config.optimizer == "rmsprop":
+        return optax.scale_by_rms(
+            config.rmsprop_decay, config.rmsprop_epsilon, initial_scale=1.0, eps_in_sqrt=True
+        )
+    return optax.scale_by_adam(eps=config.adam_epsilon)
+
+
 def optimizer(config: Config, hypers: Hypers) -> optax.GradientTransformation:
-    """Global-norm clipping, then Adam without its step size (which is traced)."""
-    return optax.chain(
-        optax.clip_by_global_norm(hypers.max_grad_norm),
-        optax.scale_by_adam(eps=config.adam_epsilon),
-    )
+    """Global-norm clipping, then the optimizer's scaling."""
+    return optax.chain(optax.clip_by_global_norm(hypers.max_grad_norm), scaling(config))
 
 
-def init_state(policy: Policy, key: Array) -> TrainState:
+def init_state(config: Config, policy: Policy, key: Array) -> TrainState:
     params = policy.init(key)
-    return TrainState(params, optax.scale_by_adam().init(params))
+    return TrainState(params, scaling(config).init(params))
 
 
 def vex_targets(batch: Batch, target: VexTarget) -> Array:
@@ -63,14 +77,26 @@ def minibatch_losses(
     policy: Policy,
     target: VexTarget,
 ) -> Losses:
-    """Eq. 6 on one minibatch of `[B]` samples."""
+    """The algorithm's objective on one minibatch of `[B]` samples."""
     output = policy.apply(params, batch.observation)
     advantage = batch.advantage
     if config.normalize_advantages:
         advantage = standardize(advantage, batch.weight)
     vex_target = vex_targets(batch, target)
+    log_prob = policy.distribution.log_prob(output.policy, batch.action)
+    if config.algorithm == "a2c":
+        return a2c.combine(
+            log_prob,
+            advantage,
+            output.value,
+            batch.return_,
+            (output.vex - vex_target) ** 2,
+            policy.distribution.entropy(output.policy),
+            batch.weight,
+            hypers,
+        )
     return combine(
-        policy.distribution.log_prob(output.policy, batch.action) - batch.log_prob,
+        log_prob - batch.log_prob,
         advantage,
         value_error(
             output.value,
@@ -115,9 +141,9 @@ def update(
     def minibatch(state: TrainState, rows: Array) -> tuple[TrainState, tuple[Losses, Array]]:
         part = jax.tree.map(lambda x: x[rows], batch)
         gradient, losses = jax.grad(loss, has_aux=True)(state.params, part)
-        step, (_, adam) = transform.update(gradient, (optax.EmptyState(), state.optimizer))
+        step, (_, scale) = transform.update(gradient, (optax.EmptyState(), state.optimizer))
         params = state.params - hypers.learning_rate * step
-        return TrainState(params, adam), (losses, jnp.linalg.norm(gradient))
+        return TrainState(params, scale), (losses, jnp.linalg.norm(gradient))
 
     parts = order.reshape((config.epochs * config.minibatches, -1))
     state, (losses, norms) = jax.lax.scan(minibatch, state, parts)

@@ -15,6 +15,7 @@ from sauna import rundir
 from sauna.envs.probe import Probe
 from sauna.errors import BadInput, Interrupted
 from sauna.placement import look_at, placed
+from sauna.presets import algorithm_of, chosen_preset
 from sauna.run import check_read_after_settling, settle
 from sauna.study.local import LocalExecutor
 from sauna.study.results import gather, typed
@@ -36,12 +37,15 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     rules = {}
     if "sauna-reference" in arms:  # beside it the others take its rules, so that the filter differs
         rules = {"truncation": "terminate", "budget": "env"}
-    arms_of = [{"label": arm} for arm in arms]
-    values = {"tasks": [env], "arms": arms_of, "seeds": SEEDS, **rules, **settings}
+    algorithm = algorithm_of(chosen_preset(settings))
+    own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
+    entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
+    values = {"tasks": [env], "arms": entries, "seeds": SEEDS, **rules, **settings}
     text = json.dumps(values, sort_keys=True, default=list)
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return read_spec({"name": f"compare_{place}_{digest}", "baseline": arms[0], **values})
+    name, baseline = f"compare_{place}_{digest}", entries[0]["label"] if entries else ""
+    return read_spec({"name": name, "baseline": baseline, **values})
 
 
 def compare_command(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> str:

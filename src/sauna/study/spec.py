@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 from sauna.config import FIELDS, Config, check_read, parse
 from sauna.errors import BadInput, nearest
-from sauna.presets import ARMS, FIXED, parse_all, resolve
+from sauna.presets import ARMS, FIXED, arm_config, parse_all, resolve
 
 # What a study decides itself.
 _OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard", "distributed")
@@ -122,15 +122,16 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
                 if key in entry}  # fmt: skip
     return Arm(
         _text(entry.get("label", arm), "label"), arm,
-        {**{key: value for key, value in common.items() if reads(arm, own, key)}, **own},
+        {**{key: value for key, value in common.items() if reads(arm, {**common, **own}, key)},
+         **own},
         tuple(_text(task, "tasks") for task in tasks), seeds,
         optional.get("baseline"), optional.get("rates_of"),
     )  # fmt: skip
 
 
-def reads(arm: str, own: Mapping[str, Any], key: str) -> bool:
-    """Whether a run of `arm` with its `own` settings takes the setting `key` at all."""
-    config = dataclasses.replace(Config(), **{**ARMS[arm], **parse_all(own)}, arm=(arm,))
+def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
+    """Whether a run of `arm` with these settings takes the setting `key` at all."""
+    config = dataclasses.replace(arm_config(arm, parse_all(settings)), arm=(arm,))
     try:
         check_read([config], {key: None})
     except BadInput:
