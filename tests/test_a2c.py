@@ -232,7 +232,7 @@ OPTIONS = [
 @pytest.mark.parametrize("arm, settings", OPTIONS)
 def test_every_filter_works_at_5_steps_and_16_environments(arm: str, settings: dict) -> None:
     """It drops, no rollout is empty, and a resumed run ends with the same bytes."""
-    job = job_of(arm, iterations=20, **settings)
+    job = job_of(arm, iterations=10, **settings)
     whole = train_here(job)
     assert len(whole.rows) > 3
     assert 0 < min(row["keep_rate"] for row in whole.rows) < 0.95

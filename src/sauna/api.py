@@ -46,7 +46,7 @@ class _Silent(PlainDisplay):
 
 
 def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
-    """Trains PPO or SAUNA on `env` and returns the finished run.
+    """Trains PPO (or A2C), with SAUNA or without, on `env` and returns the finished run.
 
     Args:
       env: a Gymnasium id, `module:function`, or a function that makes an environment.

@@ -30,6 +30,9 @@ from sauna.envs.contract import HostEnvs, Step
 from sauna.spaces import Spaces
 
 
+_fold_in = jax.jit(jax.random.fold_in)  # compiled: rollouts of few steps draw a key often
+
+
 class CollectState(NamedTuple):
     """What persists between rollouts; arrays with a leading member axis P, changed in place."""
 
@@ -71,6 +74,8 @@ class HostCollector:
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
         self._chunks = chunk_sizes(self._config.rollout_steps)
         self._uncompiled = program.filter is not None  # without one, every stretch is a rollout
+        if program.filter is not None:
+            self._fresh_filter = program.filter.init(self._config.envs, self._capacity)
         self.observation_moments = self._observation_moments()
         self.reward_moments = initial_moments((len(keys),), 1)
         self.state = CollectState(
@@ -130,7 +135,7 @@ class HostCollector:
             self._compile_stretches(params[0], hypers[0])
         self._actor.load(params)
         self._show()
-        filters = self._start_filters()
+        filters, keys = self._start_filters(), self._filter_keys(iteration)
         plans = [self._plan(member, 0, limit) for member in members]
         noise, t, block = np.zeros(0), 0, self._config.rollout_steps
         final_values: dict[tuple[int, int, int], float] = {}
@@ -147,7 +152,7 @@ class HostCollector:
                 if plans[member].last == t:
                     first = plans[member].first
                     self._score(params[member], member, first, t)
-                    self._decide(filters, hypers[member], iteration, member, first, t)
+                    self._decide(filters, keys, hypers[member], member, first, t)
                     plans[member] = self._plan(member, t, limit)
         self._fill_next_values(params, final_values, t)
         return [self._collected(member) for member in members]
@@ -256,13 +261,21 @@ class HostCollector:
             getattr(buffers, name)[member, rows] = scores[..., i]
 
     def _start_filters(self) -> list[Any]:
-        filter = self._program.filter
-        if filter is None:
+        return [] if self._program.filter is None else [self._fresh_filter for _ in self._keys]
+
+    def _filter_keys(self, iteration: int) -> list[Any]:
+        if self._program.filter is None:
             return []
-        return [filter.init(self._config.envs, self._capacity) for _ in self._keys]
+        return [_fold_in(keys.filter, np.int32(iteration)) for keys in self._keys]
 
     def _decide(
-        self, filters: list[Any], hypers: Hypers, iteration: int, member: int, first: int, last: int
+        self,
+        filters: list[Any],
+        keys: list[Any],
+        hypers: Hypers,
+        member: int,
+        first: int,
+        last: int,
     ) -> None:
         """Writes `keep` for the rows of a member's stretch."""
         buffers, rows = self._buffers, slice(first, last)
@@ -276,7 +289,7 @@ class HostCollector:
             self._padded(buffers.vex[member, rows]),
             np.int32(first),
             np.int32(last - first),
-            jax.random.fold_in(self._keys[member].filter, iteration),
+            keys[member],
             hypers,
         )
         buffers.keep[member, rows] = np.asarray(mask)[: last - first] & valid
