@@ -29,7 +29,6 @@ from sauna.core.types import Hypers, Rollout
 from sauna.envs.contract import HostEnvs, Step
 from sauna.spaces import Spaces
 
-
 _fold_in = jax.jit(jax.random.fold_in)  # compiled: rollouts of few steps draw a key often
 
 
