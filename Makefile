@@ -4,6 +4,7 @@
 # make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
 # make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
+# make cost   what checks and checkpoints take of a training
 # make lint   style, format and types
 # make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
 
@@ -11,7 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: setup demo test test-slow campaign mutants soak lint results clean
+.PHONY: setup demo test test-slow campaign mutants soak cost lint results clean
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
@@ -48,6 +49,9 @@ mutants: .venv/.dev
 
 soak: .venv/.dev
 	$(BIN)/python tests/faults/soak.py
+
+cost: .venv/.dev
+	$(BIN)/python tests/faults/cost.py
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

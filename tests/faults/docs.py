@@ -13,7 +13,7 @@ def write(page: Path, stored: dict[str, Any]) -> None:
     """Puts what was measured between the page's markers; what was not says so."""
     text = page.read_text()
     for name, lines in (("campaign", _campaign(stored)), ("mutants", _mutants()),
-                        ("soak", _soak())):  # fmt: skip
+                        ("soak", _soak()), ("checks", _checks())):  # fmt: skip
         begin, end = f"<!-- {name} begin -->\n", f"<!-- {name} end -->"
         head, _, rest = text.partition(begin)
         text = head + begin + "\n".join(lines) + "\n" + end + rest.partition(end)[2]
@@ -66,3 +66,19 @@ def _soak() -> list[str]:
         change = f"{row['per_hour']:+.2f} ({row['low']:+.2f} to {row['high']:+.2f})"
         lines.append(f"| {units[name]} | {row['mean']:,.1f} | {row['largest']:,.1f} | {change} |")
     return lines
+
+
+def _checks() -> list[str]:
+    found = _load("checks")
+    if found is None:
+        return ["Not measured yet."]
+    host, device = found["host"], found["device"]
+    lines = [f"Shares of the time of a training ({host['env']}, one process):", "",
+             "| seeds | finite checks | logging | checkpoints, with their hashing | all |",
+             "|---|---|---|---|---|"]  # fmt: skip
+    for members, part in host["members"].items():
+        shares = (f"{part[name]:.2%}" for name in ("checks", "logging", "checkpoints", "all"))
+        lines.append(f"| {members} | {' | '.join(shares)} |")
+    return [*lines, "", f"Compiled in: {max(found['update'], 0.0):.2%} of an update, and "
+            f"{max(device['share'], 0.0):.2%} of an iteration on the device ({device['env']}, "
+            f"{device['envs']} environments)."]  # fmt: skip
