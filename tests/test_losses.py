@@ -152,7 +152,7 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
         target = TARGETS["sample"]
         batch = jax.tree.map(jnp.asarray, random_batch())
         order = minibatch_order(config, seed=7, iteration=2)
-        state = init_state(policy, jax.random.key(0))
+        state = init_state(config, policy, jax.random.key(0))
         state = jax.tree.map(lambda x: x.astype(jnp.float64) if x.dtype == np.float32 else x, state)
         got, _, norm = update(state, batch, h, order, config=config, policy=policy, target=target)
 
