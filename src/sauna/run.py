@@ -25,6 +25,7 @@ from sauna.metrics.tensorboard import TensorBoard
 from sauna.placement import look_at, placed
 from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_config
 from sauna.spaces import Spaces
+from sauna.untrusted import JSON_BYTES
 from sauna.worker import configure_jax
 
 # Fields that `resume` may change: they do not touch what is computed, or only its rounding where
@@ -283,7 +284,8 @@ def _drop_rates(everyone: list[Member]) -> list[list[float]]:
     """Per member, the drop rate that the run it repeats had in every iteration.
 
     Raises:
-      BadInput: that run is not complete, lacks a seed, or is not of exactly one filtered arm.
+      BadInput: that run is not complete, lacks a seed, is not of exactly one filtered arm, or has
+        more rates than `config.json` can hold.
     """
     source = everyone[0].config.drop_rate_from
     if not source:
@@ -301,7 +303,11 @@ def _drop_rates(everyone: list[Member]) -> list[list[float]]:
     for member in everyone:
         if member.seed not in rates:
             raise BadInput(f"drop_rate_from: {source} has no rows of seed {member.seed}")
-    return [rates[member.seed] for member in everyone]
+    found = [rates[member.seed] for member in everyone]
+    if len(json.dumps(found)) > JSON_BYTES // 2:  # what cannot be read again is not begun
+        raise BadInput(f"drop_rate_from: {source} has {max(map(len, found))} iterations, too many "
+                       f"to repeat for {len(found)} seeds in one run")  # fmt: skip
+    return found
 
 
 def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> None:
