@@ -163,13 +163,20 @@ def _limit(config: Config, counters: Counters) -> int:
 
 
 def _hypers(job: Job, p: int, counters: Counters, iteration: int) -> Hypers:
-    """A member's traced hyperparameters in this iteration."""
-    own = job.members[p].config
+    rates = job.drop_rates[p] if job.drop_rates else []
+    return hypers_now(job.members[p].config, rates, counters, iteration)
+
+
+def hypers_now(own: Config, drop_rates: list[float], counters: Counters, iteration: int) -> Hypers:
+    """A member's traced hyperparameters in this iteration.
+
+    Args:
+      own: its config.
+      drop_rates: of each iteration; empty: the config's constant one.
+    """
     used = counters.kept_steps if own.budget == "kept" else counters.env_steps
     left = 1.0 - used / own.steps if own.learning_rate_schedule == "linear" else 1.0
-    rate = own.drop_rate
-    if job.drop_rates:
-        rate = job.drop_rates[p][min(iteration, len(job.drop_rates[p]) - 1)]
+    rate = drop_rates[min(iteration, len(drop_rates) - 1)] if drop_rates else own.drop_rate
     values = {name: getattr(own, name) for name in Hypers._fields}
     values |= {"learning_rate": own.learning_rate * left, "drop_rate": rate}
     return Hypers(**{name: np.float32(value) for name, value in values.items()})  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ from sauna.placement import look_at, placed
 from sauna.presets import algorithm_of, chosen_preset
 from sauna.run import check_read_after_settling, settle
 from sauna.study.local import LocalExecutor
+from sauna.study.measuring import gather_measured, measure
 from sauna.study.results import gather, typed
 from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
@@ -108,6 +109,8 @@ def _check_runs(spec: Spec) -> None:
     for arm in spec.arms:
         for task in arm.tasks:
             config = placed(check(arm, task))
+            if spec.measure and config.backend == "device":
+                raise BadInput(f"backend: measure needs environments on the host, not {task}")
             key = task, config.env_kwargs, config.backend
             if key not in found:
                 found[key] = look_at(config)
@@ -146,6 +149,9 @@ def _train(
         view.open()
         try:
             executor(folder, jobs, view, lambda: bool(noted)).run(units)
+            view.close()
+            if spec.measure:
+                measure(spec, units, folder, place, jobs, say, lambda: bool(noted))
         finally:
             view.close()
             held.close()
@@ -179,13 +185,20 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
 
 def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
     """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
+    from sauna.study.figures import NOTHING
+    from sauna.study.noise import extra as noise
     from sauna.study.report import write_report
 
     results = gather(spec, units, folder, command)
     summary = summarize(results)
     rundir.write_json(place / "results.json", results)
     rundir.write_json(place / "summary.json", summary)
-    write_report(results, summary, place)
+    extra = NOTHING
+    if spec.measure:
+        measured = gather_measured(spec, units, folder, place)
+        rundir.write_json(place / f"{spec.measure}.json", measured)
+        extra = {"noise": noise}[spec.measure](measured)
+    write_report(results, summary, place, extra)
     return summary
 
 

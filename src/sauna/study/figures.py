@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,17 @@ class Plot:
     limits: tuple[float, float] | None
     panels: list[Panel]
 
+
+class Extra(NamedTuple):
+    """What a measurement adds to the page and the figures of a study."""
+
+    title: str
+    html: str
+    plots: Sequence[Plot]
+    looks: Mapping[str, style.Look]
+
+
+NOTHING = Extra("", "", (), {})
 
 # name of the file, key in the curves, title, caption, y axis, its limits
 _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] = (
@@ -154,15 +165,23 @@ def _any(values: Iterable[float | None]) -> bool:
 
 
 def write_figures(
-    results: Mapping[str, Any], summary: Mapping[str, Any], folder: Path
+    results: Mapping[str, Any], summary: Mapping[str, Any], folder: Path, extra: Extra = NOTHING
 ) -> dict[str, Path]:
     """Writes `folder/figures/NAME.png` and `.svg`; the same bytes for the same input.
 
     Returns:
       The SVG file of each figure by its name.
     """
-    looks, written = looks_of(results), {}
-    for plot in plots_of(results, summary):
+    plots = [*extra.plots, *plots_of(results, summary)]
+    return draw_plots(plots, {**looks_of(results), **extra.looks}, folder)
+
+
+def draw_plots(
+    plots: Sequence[Plot], looks: Mapping[str, style.Look], folder: Path
+) -> dict[str, Path]:
+    """Writes both files of each plot under `folder/figures`; the SVG files by name."""
+    written = {}
+    for plot in plots:
         path = folder / "figures" / plot.name
         with style.applied():
             figure = _draw(plot, looks)

@@ -14,13 +14,14 @@ Message = dict[str, Any]
 
 
 class UnitProcess:
-    """`python -m sauna.study.unit`.
+    """`python -m sauna.study.unit`, or another module that is talked to alike.
 
     Args:
       given: what the unit is given.
       log: what it prints besides its messages is appended there.
       tell: is called, in a thread of its own, with each message, and with None at the end.
       environment: of the process; by default ours.
+      module: what it runs.
     """
 
     def __init__(
@@ -29,10 +30,11 @@ class UnitProcess:
         log: Path,
         tell: Callable[[Message | None], None],
         environment: Mapping[str, str] | None = None,
+        module: str = "sauna.study.unit",
     ) -> None:
         with log.open("a") as file:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "sauna.study.unit"],
+                [sys.executable, "-m", module],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,

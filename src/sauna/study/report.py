@@ -20,7 +20,7 @@ from string import Template
 from typing import Any
 
 from sauna.study import tables
-from sauna.study.figures import Panel, Plot, looks_of, plots_of, write_figures
+from sauna.study.figures import NOTHING, Extra, Panel, Plot, looks_of, plots_of, write_figures
 from sauna.style import Look, short
 
 # A shape beside the colour of each kind of verdict.
@@ -33,30 +33,37 @@ MARKS = {
 UNFOLDED = 5  # verdicts that are shown with all their words
 
 
-def write_report(results: dict[str, Any], summary: dict[str, Any], folder: Path) -> Path:
+def write_report(
+    results: dict[str, Any], summary: dict[str, Any], folder: Path, extra: Extra = NOTHING
+) -> Path:
     """Writes `folder/report.html` and `folder/figures/`; the same bytes for the same input.
 
     Args:
       results: what `results.json` holds.
       summary: what `summary.json` holds.
       folder: made where it is missing.
+      extra: what a measurement adds.
 
     Returns:
       The page.
     """
-    pictures = write_figures(results, summary, folder)
+    pictures = write_figures(results, summary, folder, extra)
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(make_page(results, summary, pictures), encoding="utf-8")
+    path.write_text(make_page(results, summary, pictures, extra), encoding="utf-8")
     return path
 
 
 def make_page(
-    results: Mapping[str, Any], summary: Mapping[str, Any], pictures: Mapping[str, Path]
+    results: Mapping[str, Any],
+    summary: Mapping[str, Any],
+    pictures: Mapping[str, Path],
+    extra: Extra = NOTHING,
 ) -> str:
     """The page as text; `pictures` are the SVG files that it shows where no script runs."""
     script, css, page = (_asset(f"report.{kind}") for kind in ("js", "css", "html"))
-    looks, plots = looks_of(results), plots_of(results, summary)
+    looks = {**looks_of(results), **extra.looks}
+    plots = [*extra.plots, *plots_of(results, summary)]
     return Template(page).substitute(
         style=css + line_colours(looks),
         script=script,
@@ -65,6 +72,9 @@ def make_page(
         data=embedded(page_data(looks, plots)),
         title=escape(results["name"]),
         scope=scope(results),
+        extra=f'<section id="measured"><h2>{extra.title}</h2>{extra.html}</section>'
+        if extra.title
+        else "",
         verdicts=verdicts(summary["verdicts"]),
         table=tables.main_table(results, summary),
         over_tasks=tables.over_tasks(results, summary),

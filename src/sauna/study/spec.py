@@ -14,8 +14,9 @@
     threshold = 0.8
 
 Any setting of a run may stand at the top, for all arms, or in an arm. `baseline` is the label that
-others are compared with. An arm may name its own `tasks`, `seeds` and `baseline`; a `random-drop`
-arm repeats the measured drop rates of the arm `rates_of`.
+others are compared with. `measure` names what is measured of the trained members at checkpoints
+along their training (`noise`). An arm may name its own `tasks`, `seeds` and `baseline`; a
+`random-drop` arm repeats the measured drop rates of the arm `rates_of`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ from sauna.presets import ARMS, FIXED, arm_config, parse_all, resolve
 # What a study decides itself.
 _OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard", "distributed")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
-_TOP = ("name", "tasks", "seeds", "baseline", "arms")
+_TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
+MEASURES = ("noise",)
 _ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
 
 
@@ -63,6 +65,7 @@ class Spec(NamedTuple):
     baseline: str
     arms: list[Arm]
     text: dict[str, Any]
+    measure: str | None = None  # what is measured of the members once they are trained
 
     @property
     def tasks(self) -> list[str]:
@@ -97,10 +100,10 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
             raise BadInput(f"study: the label {label!r} is given twice")
     baseline = _text(values.get("baseline", labels[0]), "baseline")
     arms = [_settle(arm, arms, baseline) for arm in arms]
-    spec = Spec(name, baseline, arms, _plain(values))
-    for arm in arms:
-        for task in arm.tasks:
-            check(arm, task)
+    spec = Spec(name, baseline, arms, _plain(values), values.get("measure"))
+    configs = [check(arm, task) for arm in arms for task in arm.tasks]
+    if spec.measure is not None:
+        _check_measure(spec.measure, configs)
     return spec
 
 
@@ -145,6 +148,28 @@ def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
         if not any(key in arm.settings for arm in arms):
             raise BadInput(f"study: {key} is read by none of the arms "
                            f"{', '.join(arm.label for arm in arms)}")  # fmt: skip
+
+
+def _check_measure(measure: Any, configs: list[Config]) -> None:
+    """Refuses a measurement that is not known or would lack what it needs."""
+    if measure not in MEASURES:
+        raise BadInput(f"study: measure must be one of {', '.join(MEASURES)}, not {measure!r}"
+                       f"{nearest(str(measure), MEASURES)}")  # fmt: skip
+    for config in configs:
+        rollout = config.rollout_steps * config.envs
+        kept = config.keep_checkpoints * config.checkpoint_every * rollout
+        if kept < config.steps:
+            raise BadInput("keep_checkpoints: measure needs the checkpoints along training; set "
+                           "checkpoint_every = 10 and keep_checkpoints = 1000")  # fmt: skip
+        if config.backend == "device":
+            raise BadInput("backend: measure needs environments on the host")
+    if measure == "noise" and all(map(drops_nothing, configs)):
+        raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
+
+
+def drops_nothing(config: Config) -> bool:
+    """Whether there is nothing dropped to measure, or no advantage of what is dropped."""
+    return config.filter == "none" or config.gae_over == "kept"
 
 
 def _text(value: Any, key: str) -> str:

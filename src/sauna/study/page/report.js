@@ -156,6 +156,7 @@
       return;
     }
     const steps = plot.x_label === "env steps";
+    const drawn = new Set(plot.panels.flatMap((one) => one.lines.map((line) => line.label)));
     const rest = Math.floor((xs.length - 1) * (steps ? 1 : 0.5));
     const input = html(area, "input", {
       type: "range", min: 0, max: xs.length - 1, value: rest,
@@ -188,7 +189,7 @@
 
     function showValues() {
       const x = xs[input.value];
-      const at = steps ? `${short(x)} env steps` : `a final return of ${number(x, digitsOf(xDomain))}`;
+      const at = steps ? `${short(x)} env steps` : `a ${plot.x_label} of ${number(x, digitsOf(xDomain))}`;
       overlay.replaceChildren();
       svg(overlay, "line", { class: "cursor", x1: X(x), x2: X(x), y1: EDGE.top, y2: height - EDGE.bottom });
       readout.replaceChildren();
@@ -196,7 +197,7 @@
       const body = html(readout, "tbody");
       const said = [];
       for (const [label, look] of looks) {
-        if (hidden.has(label)) continue;
+        if (hidden.has(label) || !drawn.has(label)) continue;
         const line = panel.lines.find((one) => one.label === label);
         const i = line ? nearest(line, x) : null;
         const [y, low, high] = i === null ? [null, null, null] : [line.y[i], line.low[i], line.high[i]];

@@ -1,0 +1,1 @@
+"""Measurements of trained members at their checkpoints; see `measure/__main__.py`."""

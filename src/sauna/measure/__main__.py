@@ -1,0 +1,57 @@
+"""Measurements of one member, as a process.
+
+    python -m sauna.measure < settings
+
+The first line of standard input holds, as JSON, what is measured (`noise`), the run, the member's
+name, the checkpoints' numbers, and the file that each measurement is written to. What is written
+is whole, so that a process that is stopped loses only the checkpoint it was at. The end of standard
+input means that whoever asked is gone: the process ends. Mistakes are told as JSON lines.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from sauna import rundir
+from sauna.errors import SaunaError
+from sauna.worker import configure_jax
+
+
+def measure(given: dict[str, Any]) -> None:
+    """Makes every measurement whose file is not there yet."""
+    configure_jax()
+    from sauna.measure.noise import measure as noise
+    from sauna.measure.streams import load_standing
+
+    what = {"noise": noise}[given["what"]]
+    for iteration, file in zip(given["iterations"], given["files"], strict=True):
+        if Path(file).exists():
+            continue
+        standing = load_standing(Path(given["run"]), given["member"], iteration)
+        found = {"iteration": iteration, "env_steps": standing.env_steps, **what(standing)}
+        rundir.write_json(Path(file), found)
+
+
+def main() -> int:
+    given = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_our_parent, daemon=True).start()
+    try:
+        measure(given)
+    except SaunaError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 1
+    return 0
+
+
+def _end_with_our_parent() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,173 @@
+"""Fresh experience of a member as it was at one of its checkpoints.
+
+A stream is what the member's next rollouts could have been: its policy, value and Vex head and its
+normaliser as they stood, its own filter deciding, but episodes and action noise of their own. It
+begins at a random moment of an episode, as rollouts in training do. Every rollout of a stream
+starts from the checkpoint's normaliser; nothing is learned in between. Streams of one checkpoint
+are independent and alike, which is what the statistics rest on; steps within a stream are not.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from sauna import rundir
+from sauna.checkpoint import load_checkpoint
+from sauna.collect.collected import capacity
+from sauna.collect.host import HostCollector
+from sauna.config import Config
+from sauna.core.batch import advantages_over_all
+from sauna.core.population import Program, make_program, member_keys
+from sauna.core.types import Array, Hypers, Rollout
+from sauna.envs.backend import in_process_envs
+from sauna.member_state import Counters, fitting, flat_params, moments_of, under
+from sauna.presets import Member, members, stored_config
+from sauna.spaces import Spaces, read_spaces
+from sauna.training import hypers_now
+
+FRESH = 0x5A07A  # sets the seeds of streams apart from those of training
+
+
+class Standing(NamedTuple):
+    """A member as it was at a checkpoint."""
+
+    config: Config
+    spaces: Spaces
+    member: Member
+    iteration: int
+    program: Program
+    params: Array  # [D]
+    hypers: Hypers
+    arrays: dict[str, np.ndarray]  # the member's, named as in the checkpoint
+    env_steps: int
+
+
+class Stream(NamedTuple):
+    """The `n` env steps of one stream, each env's in time order."""
+
+    observation: np.ndarray  # [n, *obs] normalised
+    action: np.ndarray  # [n, A]
+    advantage: np.ndarray  # [n] over the full stream, dropped steps included
+    keep: np.ndarray  # [n] bool, the filter's decisions
+    shifted: np.ndarray  # [n] bool, the same decisions moved in time by a random offset
+    seen: np.ndarray  # [n, *obs] what the environment showed, not normalised
+
+
+def load_standing(run: Path, name: str, iteration: int) -> Standing:
+    """The member `name` of a host run at its checkpoint `iteration`.
+
+    Raises:
+      BadCheckpoint: the checkpoint cannot be trusted or read.
+    """
+    stored = rundir.read_config(run)
+    loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
+    config = stored_config(loaded.manifest["config"])
+    spaces = read_spaces(loaded.manifest["spaces"])
+    everyone = members(config, loaded.manifest["given"])
+    place = next(p for p, member in enumerate(everyone) if member.name == name)
+    arrays = under(name + "/", loaded.arrays)
+    program = make_program(config, spaces)
+    example = program.init(jax.random.key(0)).params
+    params = flat_params(program.policy, example, under("params/", arrays))
+    counters = Counters.from_arrays(arrays)
+    rates = stored["drop_rates"][place] if stored["drop_rates"] else []
+    hypers = hypers_now(everyone[place].config, rates, counters, iteration)
+    return Standing(
+        config, spaces, everyone[place], iteration, program, params, hypers, arrays,
+        counters.env_steps,
+    )  # fmt: skip
+
+
+def fresh_streams(standing: Standing, number: int, rollouts: int) -> list[Stream]:
+    """`number` independent streams of `rollouts` rollouts; the same for the same checkpoint."""
+    config = standing.config
+    roots = np.random.SeedSequence([FRESH, standing.member.seed, standing.iteration])
+    random = np.random.default_rng(roots)
+    seeds = [int(seed) for seed in roots.generate_state(number)]
+    pairs = [(seed, n) for seed in seeds for n in range(config.envs)]
+    made = in_process_envs(config.env, json.loads(config.env_kwargs), pairs, config.backend)
+    envs = _Recorded(made)
+    try:
+        collector = HostCollector(
+            standing.program, standing.spaces, envs, [member_keys(seed) for seed in seeds]
+        )
+        collector.start()
+        params = np.tile(np.asarray(standing.params), (number, 1))
+        hypers = [standing.hypers] * number
+        # A random number of steps is thrown away, so that no stream begins with a reset.
+        _put_moments(collector, standing)
+        collector.collect(params, hypers, 0, random.integers(0, config.rollout_steps, number))
+        parts: list[list[Stream]] = [[] for _ in seeds]
+        whole = np.full(number, capacity(config))
+        advantages = jax.jit(
+            partial(advantages_over_all, bootstrap_truncated=config.truncation == "bootstrap")
+        )
+        for i in range(rollouts):
+            _put_moments(collector, standing)
+            envs.begin(collector.state.observation)
+            collected = collector.collect(params, hypers, i + 1, whole)
+            seen = envs.seen()
+            for p, own in enumerate(collected):
+                assert own.rollout is not None
+                advantage = np.asarray(advantages(own.rollout, standing.hypers))
+                parts[p].append(_flat(own.rollout, advantage, seen[:, p], random))
+    finally:
+        envs.close()
+    return [Stream(*map(np.concatenate, zip(*own, strict=True))) for own in parts]
+
+
+def _put_moments(collector: HostCollector, standing: Standing) -> None:
+    """The checkpoint's normaliser in every stream."""
+    for p in range(len(collector.state.observation)):
+        for key, place in moments_of(collector, p).items():
+            place[...] = fitting(standing.arrays, key, place)
+
+
+def _flat(
+    rollout: Rollout, advantage: np.ndarray, seen: np.ndarray, random: np.random.Generator
+) -> Stream:
+    """The valid steps of a rollout `[S, N]`, env after env, copied."""
+    steps = np.asarray(rollout.valid).sum(0)
+
+    def flat(x: Any) -> np.ndarray:
+        return np.concatenate([np.asarray(x)[:length, n] for n, length in enumerate(steps)])
+
+    keep = np.asarray(rollout.keep)
+    moved = [np.roll(keep[:length, n], random.integers(length)) for n, length in enumerate(steps)]
+    return Stream(
+        flat(rollout.observation), flat(rollout.action), flat(advantage), flat(keep),
+        np.concatenate(moved), flat(seen),
+    )  # fmt: skip
+
+
+class _Recorded:
+    """Host environments that note what they show."""
+
+    def __init__(self, envs: Any) -> None:
+        self._envs = envs
+        self._shown: list[np.ndarray] = []
+        self._shape: tuple[int, ...] = ()
+
+    def begin(self, observation: np.ndarray) -> None:
+        """Forgets what was shown; `observation` `[P, N, *obs]` is what is seen now."""
+        self._shape = observation.shape
+        self._shown = [observation.copy()]
+
+    def seen(self) -> np.ndarray:
+        """`[S, P, N, *obs]`: the observation at each env step since `begin`."""
+        return np.stack(self._shown[:-1])
+
+    def step(self, action: np.ndarray, active: np.ndarray) -> Any:
+        step = self._envs.step(action, active)
+        if self._shape:
+            self._shown.append(step.observation.reshape(self._shape).copy())
+        return step
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._envs, name)

@@ -1,0 +1,265 @@
+"""Noise of minibatch gradients: the gradient, the estimators where the truth is known, streams."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers import configured
+from sauna import train
+from sauna.core.gradient import policy_gradient
+from sauna.core.normalize import Moments, normalize
+from sauna.core.policy import make_policy
+from sauna.core.update import minibatch_losses
+from sauna.errors import BadInput
+from sauna.measure import estimates, noise
+from sauna.measure.estimates import Gradients, estimate
+from sauna.measure.streams import Standing, Stream, fresh_streams, load_standing
+from sauna.selection.vex import TARGETS
+from sauna.study.noise import extra, over_members, text_table, verdicts
+from sauna.study.spec import read_spec
+from test_losses import VECTOR, hypers, random_batch
+
+PAIRS = (("dropped", "coin"),)
+GROUPS = ("dropped", "coin")
+
+
+def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
+    config = configured(hidden="8,8")
+    policy = make_policy(config, VECTOR)
+    with jax.enable_x64(True):
+        params = jnp.asarray(policy.init(jax.random.key(0)), jnp.float64)
+        batch = random_batch()
+        output = policy.apply(params, batch.observation)
+        log_prob = policy.distribution.log_prob(output.policy, batch.action)
+        batch = batch._replace(log_prob=log_prob)
+        h = hypers(entropy_coef=0.0, value_coef=0.0, vex_coef=0.0)
+
+        def loss(params: Any) -> Any:
+            return minibatch_losses(
+                params, batch, h, config=config, policy=policy, target=TARGETS["sample"]
+            ).total
+
+        got = policy_gradient(
+            params, batch.observation, batch.action, batch.advantage, batch.weight,
+            policy=policy, standardized=True,
+        )  # fmt: skip
+        np.testing.assert_allclose(got, -jax.grad(loss)(params), atol=1e-12)
+        assert np.abs(got).max() > 1e-3
+
+
+def test_the_gradient_by_hand_where_it_is_simple() -> None:
+    """Of the Gaussian's log-std it is the mean of `A (z^2 - 1)`, of the head's bias `A z / std`."""
+    policy = make_policy(configured(hidden="8,8"), VECTOR)
+    params, batch = policy.init(jax.random.key(1)), random_batch(6)
+    observation, action = (x.astype(np.float32) for x in (batch.observation, batch.action))
+    mean, log_std = np.split(np.asarray(policy.apply(params, observation).policy), 2, -1)
+    z, a, w = (action - mean) / np.exp(log_std), batch.advantage[:, None], batch.weight[:, None]
+    gradient = policy_gradient(
+        params, observation, action, batch.advantage.astype(np.float32), w[:, 0], policy=policy,
+        standardized=False,
+    )  # fmt: skip
+    got = policy.unravel(gradient)["params"]
+    np.testing.assert_allclose(got["log_std"], (w * a * (z**2 - 1)).sum(0) / w.sum(), rtol=1e-4)
+    bias = (w * a * z / np.exp(log_std)).sum(0) / w.sum()
+    np.testing.assert_allclose(got["policy_head"]["bias"], bias, rtol=1e-4)
+    assert not np.any(got["value_head"]["bias"])
+
+
+@pytest.fixture
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimates, "RESAMPLES", 200)
+
+
+def drawn(
+    random: np.random.Generator, means: np.ndarray, spread: np.ndarray, streams: int = 32
+) -> Gradients:
+    """Streams of minibatch gradients `N(mean + the stream's own shift, spread^2)` of two groups."""
+    minibatches, size = 8, means.shape[1]
+    shift = 0.5 * random.normal(size=(streams, 1, 1, size))
+    h = (
+        means[:, None]
+        + shift
+        + spread[:, None, None] * random.normal(size=(streams, len(means), minibatches, size))
+    )
+    reference = means[1] + 0.3 * random.normal(size=(streams, size))
+    direction = reference.mean(0) / np.linalg.norm(reference.mean(0))
+    cosine = (h @ direction / np.linalg.norm(h, axis=-1)).mean(2)
+    rate = np.ones((streams, len(means)))
+    return Gradients(h.mean(2), (h**2).sum(-1).mean(2), cosine, reference, rate)
+
+
+def test_estimates_are_unbiased_and_intervals_hold_the_truth(few_resamples: None) -> None:
+    random, size = np.random.default_rng(0), 20
+    means = np.stack([np.full(size, 0.3), np.r_[np.full(10, 0.6), np.zeros(10)]])
+    spread = np.array([1.0, 0.5])
+    signal = (means**2).sum(1)
+    variance = size * (spread**2 + 0.25)  # of a minibatch: its own noise and its stream's
+    truth = {"signal": signal, "variance": variance, "snr": signal / variance,
+             "snr_per_env_step": signal / variance}  # fmt: skip
+    cosine = means[0] @ means[1] / np.sqrt(signal.prod())
+    values: dict[str, list[np.ndarray]] = {name: [] for name in [*truth, "alignment"]}
+    held: dict[str, list[bool]] = {name: [] for name in [*truth, "alignment"]}
+    for _ in range(100):
+        found = estimate(drawn(random, means, spread), GROUPS, PAIRS)["groups"]
+        for name in values:
+            expected = [cosine, 1.0] if name == "alignment" else truth[name]
+            for group, true in zip(GROUPS, expected, strict=True):
+                value, low, high = found[group][name]
+                values[name].append(np.array([value - true, true]))
+                held[name].append(low <= true <= high)
+    for name, pairs in values.items():
+        for place in range(2):
+            errors = np.array(pairs[place::2])[:, 0]
+            if name in ("signal", "variance"):  # others are ratios: unbiased for many streams only
+                assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(len(errors)), name
+            assert np.mean(held[name][place::2]) > 0.85, (name, place)
+
+
+def test_a_coin_finds_no_difference_and_a_real_one_is_found(few_resamples: None) -> None:
+    random, size = np.random.default_rng(1), 20
+    means = np.full((2, size), 0.3)
+    equal, noisier = 0, 0
+    for _ in range(60):
+        for spread, names in ((1.0, "equal"), (2.0, "noisier")):
+            found = estimate(drawn(random, means, np.array([spread, 1.0])), GROUPS, PAIRS)
+            own = found["differences"]["dropped - coin"]
+            if names == "equal":
+                equal += own["snr"][1] <= 0 <= own["snr"][2]
+            else:
+                noisier += own["snr"][2] < 0 and own["variance_ratio"][1] > 1
+    assert equal >= 50 and noisier >= 54
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run of two members that drop much."""
+    return train(
+        "InvertedPendulum-v5", arm="sauna", threshold=0.95, seeds=2, steps=2048, rollout_steps=256,
+        minibatches=16, hidden=[8, 8], epochs=2, processes=1, checkpoint_every=2,
+        keep_checkpoints=99, out=tmp_path_factory.mktemp("noise") / "run", quiet=True,
+    ).path  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def standing(run: Path) -> Standing:
+    return load_standing(run, "sauna/1", 4)
+
+
+@pytest.fixture(scope="module")
+def streams(standing: Standing) -> list[Stream]:
+    return fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2)
+
+
+def test_streams_are_the_members_next_rollouts(run: Path, standing: Standing, streams: Any) -> None:
+    again = fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2)
+    for one, other in zip(streams, again, strict=True):
+        assert all(np.array_equal(x, y) for x, y in zip(one, other, strict=True))
+    moments = Moments(*(standing.arrays[f"observation_moments/{name}"]
+                        for name in ("mean", "variance", "count")))  # fmt: skip
+    for stream in streams:
+        kept, steps = int(stream.keep.sum()), len(stream.keep)
+        assert kept == 2 * 256 or steps == 2 * 4 * 256  # two rollouts, full or at their bound
+        assert kept < steps and stream.shifted.sum() == kept
+        assert not np.array_equal(stream.shifted, stream.keep)
+        near = normalize(moments, stream.seen, 10.0)
+        assert np.corrcoef(near.ravel(), stream.observation.ravel())[0, 1] > 0.99
+    starts = [stream.seen[0] for stream in streams]
+    assert not any(np.array_equal(starts[0], other) for other in starts[1:])
+
+
+def test_a_measurement_has_every_estimate(
+    standing: Standing, streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noise, "fresh_streams", lambda *given: streams)
+    found = noise.measure(standing, streams=len(streams))
+    assert found["streams"] == {"reference": 8, "tested": 8, "usable": 8}
+    assert found["minibatch"] == 16 and found["as_trained"] == "standardized"
+    for rule in ("standardized", "raw"):
+        groups = found["rules"][rule]["groups"]
+        assert set(groups) == set(noise.GROUPS)
+        for value, low, high in (groups[g][n] for g in groups for n in ("cosine", "variance")):
+            assert low <= value <= high
+    json.dumps(found, allow_nan=False)
+    monkeypatch.setattr(noise, "LEAST_STREAMS", 9)
+    assert noise.measure(standing, streams=len(streams))["rules"] == {}  # nothing is claimed
+
+
+def test_minibatches_come_from_their_groups(streams: list[Stream]) -> None:
+    stream = streams[0]
+    rows = noise.draw(stream, 16, np.random.default_rng(0))
+    kept, dropped, coin, shifted = rows
+    assert rows.shape == (4, noise.MINIBATCHES, 16)
+    assert stream.keep[kept].all() and not stream.keep[dropped].any()
+    assert not stream.shifted[shifted].any()
+    assert 0 < stream.keep[coin].mean() < 1
+    assert all(len(set(part)) == 16 for part in rows.reshape(-1, 16).tolist())
+
+
+def point(at: float, snr: float, coin: float = 0.010) -> dict[str, Any]:
+    groups = {
+        name: {"snr": [x, 0, 1], "cosine": [x, 0, 1], "alignment": [1.0, 0.9, 1.1]}
+        for name, x in (("kept", 0.02), ("dropped", snr), ("coin", coin), ("shifted", coin))
+    }
+    difference = {"snr": [snr - coin, 0, 0], "cosine": [snr - coin, 0, 0],
+                  "snr_per_env_step": [0.001, 0, 0], "variance_ratio": [1.2, 1, 2]}  # fmt: skip
+    differences = dict.fromkeys(("dropped - coin", "kept - coin", "dropped - shifted"), difference)
+    rules = {"standardized": {"groups": groups, "differences": differences}}
+    return {"point": at, "keep_rate": 0.7, "minibatch": 64, "as_trained": "standardized",
+            "rules": rules}  # fmt: skip
+
+
+def measured(*members: list[dict[str, Any]]) -> dict[str, Any]:
+    listed = [{"seed": seed, "points": points} for seed, points in enumerate(members)]
+    cell = {"task": "A-v0", "label": "sauna", "arm": "sauna", "steps": 1000, "members": listed}
+    return {"name": "noise", "measure": "noise", "cells": [cell]}
+
+
+@pytest.mark.parametrize(
+    "snrs, said",
+    [
+        ((0.002, 0.003, 0.001), "what the filter drops is noisier than"),
+        ((0.022, 0.023, 0.021), "what the filter drops is less noisy"),
+        ((0.002, 0.018, 0.010), "no evidence"),
+        ((0.002,), "too few members"),
+    ],
+)
+def test_the_verdict_follows_the_interval_over_members(snrs: tuple, said: str) -> None:
+    found = measured(*([point(0.5, snr), point(1.0, snr)] for snr in snrs))
+    assert said in verdicts(found)[0]
+    assert over_members(found["cells"][0], "groups", "coin", "snr").value == pytest.approx(0.01)
+    page = extra(found)
+    assert said in page.html and [len(plot.panels[0].lines) for plot in page.plots] == [4, 4]
+    assert len(text_table(found)[1]) == len(text_table(found)[0])
+
+
+def test_where_nothing_was_dropped_nothing_is_said() -> None:
+    empty = {**point(0.5, 0.1), "rules": {}}
+    assert "no answer, because the filter dropped too few" in verdicts(measured([empty]))[0]
+    assert "At 1 of 2 checkpoints" in verdicts(measured([empty, point(1.0, 0.1)]))[0]
+    assert extra(measured([empty])).plots == []
+
+
+SPEC = {"tasks": ["A-v0"], "arms": [{"label": "sauna"}], "checkpoint_every": 10,
+        "keep_checkpoints": 1000}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"measure": "nois"}, "measure must be one of .*did you mean 'noise'"),
+        ({"measure": "noise", "keep_checkpoints": 2}, "needs the checkpoints along training"),
+        ({"measure": "noise", "backend": "device"}, "environments on the host"),
+        ({"measure": "noise", "arms": [{"label": "ppo"}]}, "needs an arm that filters"),
+    ],
+)
+def test_mistakes_in_what_to_measure_are_named(change: dict, message: str) -> None:
+    assert read_spec({**SPEC, "measure": "noise"}).measure == "noise"
+    with pytest.raises(BadInput, match=message):
+        read_spec({**SPEC, **change})
