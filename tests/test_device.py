@@ -56,6 +56,7 @@ ARMS = [
     pytest.param("ppo", {}, marks=slow),
     ("sauna", {"threshold": 0.9}),
     ("sauna", {"threshold": 0.9, "dropped": "mask"}),
+    pytest.param("sauna", {"keep_rate_target": 0.6}, marks=slow),
     pytest.param("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}, marks=slow),
     pytest.param(
         "sauna", {"threshold": 0.9, "reset": "cached", "normalize_rewards": False}, marks=slow
@@ -205,6 +206,10 @@ def test_the_learning_rate_falls_and_a_drop_rate_follows_its_list() -> None:
     job = make_job("jax_worlds:walk", arm="ppo", learning_rate=0.5)
     rows = train_here(job).rows
     np.testing.assert_allclose([r["learning_rate"] for r in rows], [0.5, 0.375, 0.25, 0.125])
+    schedule = {"threshold": 0.8, "threshold_schedule": "falling"}
+    rows = train_here(make_job("jax_worlds:walk", arm="sauna", **schedule)).rows
+    before = np.array([0, *(row["env_steps"] for row in rows[:-1])])
+    np.testing.assert_allclose([r["threshold"] for r in rows], 0.8 * (1 - before / 128), rtol=1e-5)
     job = make_job("jax_worlds:walk", arm="random-drop", drop_rate=0.1, dropped="mask", steps=256)
     rows = train_here(job._replace(drop_rates=[[0.0, 0.9]])).rows
     assert rows[0]["keep_rate"] == 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 
 import jax
@@ -11,7 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers import configured
+from helpers import configured, equal, make_job, own, resumed, train_here
+from sauna.core.update import moved_threshold
+from sauna.errors import BadInput
+from sauna.member_state import Counters
+from sauna.selection import filters
 from sauna.selection.filters import (
     Filter,
     decide,
@@ -20,9 +25,13 @@ from sauna.selection.filters import (
     make_filter,
     median,
     random_drop,
+    sauna_at_rate,
     sauna_joint,
     sauna_per_env,
+    scheduled,
+    threshold_held,
 )
+from sauna.training import hypers_now
 from test_losses import hypers
 
 
@@ -144,3 +153,117 @@ def test_deciding_in_stretches_is_deciding_step_by_step(name: str) -> None:
 
 def test_no_filter_is_none() -> None:
     assert make_filter(configured(arm="ppo")) is None
+
+
+def loop_at_rate(vex: np.ndarray, rate: float, settle: int) -> np.ndarray:
+    mask = np.zeros(vex.shape, bool)
+    for n in range(vex.shape[1]):
+        seen: list[float] = []
+        kept = 0
+        for t in range(len(vex)):
+            size = abs(float(vex[t, n]))
+            level = (1 - rate) + (kept - rate * t) / settle
+            rank = math.floor(level * (t + 1))
+            least = -math.inf if rank < 1 else math.inf if rank > t else sorted(seen)[rank - 1]
+            mask[t, n] = size >= least
+            kept += bool(mask[t, n])
+            seen.append(size)
+    return mask
+
+
+@pytest.mark.parametrize("rate", [0.25, 0.7, 1.0])
+def test_a_held_keep_rate_equals_plain_python(rate: float) -> None:
+    vex = np.random.default_rng(4).normal(0.5, 0.7, (90, 2)).astype(np.float32)
+    got = run(sauna_at_rate(rate), vex)
+    expected = loop_at_rate(vex, rate, filters.SETTLE)
+    assert (got != expected).mean() < 0.02  # float32 may round a level to the other rank
+    assert got.all() == (rate == 1.0)
+
+
+@pytest.mark.parametrize("kind", ["near 1", "wide", "rising", "falling", "negative"])
+@pytest.mark.parametrize("rate", [0.3, 0.8])
+def test_a_keep_rate_is_held_whatever_the_predictions(kind: str, rate: float) -> None:
+    """Also where they differ by a thousandth, or drift all the time; a fixed ratio does not."""
+    random, steps = np.random.default_rng(0), 1000
+    vex = {
+        "near 1": 1 + 1e-3 * random.normal(size=steps),
+        "wide": random.normal(0.3, 1.0, steps),
+        "rising": np.linspace(0.1, 1, steps) + 0.1 * random.normal(size=steps),
+        "falling": np.linspace(1, 0.1, steps) + 0.1 * random.normal(size=steps),
+        "negative": -np.exp(random.normal(size=steps)),
+    }[kind]
+    vex = np.stack([vex, vex[::-1]], 1).astype(np.float32)
+    got = run_quickly(sauna_at_rate(rate), vex)
+    assert np.abs(got.mean(0) - rate).max() < 0.06
+    if kind == "near 1":
+        assert run_quickly(sauna_per_env("all", steps), vex, 0.8).all()
+
+
+def run_quickly(filter: Filter, vex: np.ndarray, threshold: float = 0.3) -> np.ndarray:
+    h = jax.tree.map(np.float32, hypers(threshold=threshold))
+    state = filter.init(vex.shape[1], len(vex))
+    none = jnp.zeros((len(vex), vex.shape[1], 1))
+    call = jax.jit(lambda *a: decide(filter, *a, h))
+    mask = call(state, none, jnp.asarray(vex), 0, len(vex), jax.random.key(0))[1]
+    return np.asarray(mask)
+
+
+def test_threshold_0_switches_a_held_rate_off() -> None:
+    vex = np.random.default_rng(4).normal(size=(50, 2)).astype(np.float32)
+    assert not run(sauna_at_rate(0.3), vex).all() and run(sauna_at_rate(0.3), vex, 0.0).all()
+
+
+def test_the_threshold_that_is_told_would_keep_the_rate() -> None:
+    vex = np.random.default_rng(5).normal(0.5, 0.3, (200, 2)).astype(np.float32)
+    valid = np.ones(vex.shape, bool)
+    valid[150:, 1] = False
+    told = float(threshold_held(jnp.asarray(vex), jnp.asarray(valid), 0.6))
+    ratio = np.abs(vex[valid]) / abs(np.median(vex[valid]))
+    assert abs((ratio >= told).mean() - 0.6) < 0.01
+
+
+def test_a_schedule_is_linear_in_what_is_left() -> None:
+    assert [scheduled(0.8, "constant", left) for left in (1.0, 0.25)] == [0.8, 0.8]
+    np.testing.assert_allclose([scheduled(0.8, "rising", x) for x in (1, 0.25, 0)], [0, 0.6, 0.8])
+    np.testing.assert_allclose([scheduled(0.8, "falling", x) for x in (1, 0.25)], [0.8, 0.2])
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"keep_rate_target": 0.5, "threshold": 0.8}, "threshold: not read"),
+        ({"keep_rate_target": 0.5, "threshold_schedule": "rising"}, "threshold_schedule: not read"),
+        ({"keep_rate_target": 0.5, "history": "kept"}, "needs history=all"),
+        ({"keep_rate_target": 1.5}, "at most 1"),
+        ({"keep_rate_target": 0.5, "arm": "sauna-reference"}, "needs history=all"),
+        ({"keep_rate_target": 0.5, "arm": "ppo"}, "keep_rate_target: not read"),
+        ({"threshold_schedule": "rising", "arm": "vex-head"}, "threshold_schedule: not read"),
+        ({"threshold_schedule": "linear"}, "unknown value 'linear'"),
+    ],
+)
+def test_settings_of_the_threshold_that_contradict_are_refused(settings, message) -> None:
+    with pytest.raises(BadInput, match=message):
+        configured(**{"arm": "sauna", **settings})
+
+
+def test_a_schedule_follows_the_env_steps() -> None:
+    for schedule, expected in (("constant", 0.8), ("rising", 0.2), ("falling", 0.6)):
+        config = configured(arm="sauna", threshold=0.8, threshold_schedule=schedule, steps=10_000)
+        now = hypers_now(config, [], Counters(env_steps=2_500, kept_steps=9), 3)
+        np.testing.assert_allclose(now.threshold, expected, rtol=1e-6)
+        told = moved_threshold(None, now, config)  # type: ignore[arg-type] # no rollout is read
+        np.testing.assert_allclose(told, np.nan if schedule == "constant" else expected, rtol=1e-6)
+        assert float(now.learning_rate) == np.float32(3e-4 * 0.75)
+
+
+def test_a_held_rate_is_held_resumed_exactly_and_leaves_ppo_beside_it_alone() -> None:
+    common = {"env": "worlds:Scripted", "steps": 512, "rollout_steps": 64, "envs": 2}
+    job = make_job(arm="ppo,sauna", keep_rate_target=0.5, **common)
+    whole, first = train_here(job), train_here(job, 2)
+    rest = train_here(resumed(job, first))
+    assert equal(whole.final, rest.final) and whole.rows == first.rows + rest.rows
+    rows = [row for row in whole.rows if row["arm"] == "sauna"]
+    assert all(abs(row["keep_rate"] - 0.5) < 0.1 and row["threshold"] > 0 for row in rows)
+    alone = train_here(make_job(arm="ppo", **common))
+    assert equal(own(whole.final, "ppo/0"), own(alone.final, "ppo/0"))
+    assert [row for row in whole.rows if row["arm"] == "ppo"] == alone.rows

@@ -181,6 +181,12 @@ class Config:
     threshold: float = option(
         0.3, "keep where |Vex| / |median| reaches this (eq. 7)", at_least=0, shapes_program=False
     )
+    threshold_schedule: str = option(
+        "constant", "over the budget of steps: constant, rising from 0, or falling to 0",
+        choices=("constant", "rising", "falling"))  # fmt: skip
+    keep_rate_target: float = option(
+        0.0, "share of steps to keep; the threshold is moved at every step to hold it (0: off)",
+        at_least=0, at_most=1)  # fmt: skip
     history: str = option(
         "all", "steps of the rollout whose predictions the median covers", choices=("all", "kept")
     )
@@ -330,8 +336,10 @@ _READERS: dict[str, tuple[str, Any]] = {
     "adam_epsilon": ("optimizer adam", lambda c: c.optimizer == "adam"),
     **dict.fromkeys(("rmsprop_epsilon", "rmsprop_decay"),
                     ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")),
-    "threshold": ("a filter other than none and random-drop",
-                  lambda c: c.filter not in ("none", "random-drop")),
+    **dict.fromkeys(("threshold", "threshold_schedule"), (
+        "a filter other than none and random-drop, and keep_rate_target 0",
+        lambda c: c.filter not in ("none", "random-drop") and not c.keep_rate_target)),
+    "keep_rate_target": ("filter sauna", lambda c: c.filter == "sauna"),
     "history": ("filter sauna", lambda c: c.filter == "sauna"),
     "decision": ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1),
     "dropped": ("a filter", lambda c: c.filter != "none"),
@@ -388,6 +396,8 @@ def check_consistent(config: Config) -> None:
             "gae_over: kept needs truncation=terminate (the final value belongs to a step that "
             "may have been dropped)"
         )
+    if config.keep_rate_target and (config.history, config.decision) != ("all", "env"):
+        raise BadInput("keep_rate_target: needs history=all and decision=env")
     if config.drop_rate and config.drop_rate_from:
         raise BadInput("drop_rate: give either drop_rate or drop_rate_from, not both")
     if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):

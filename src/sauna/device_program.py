@@ -27,7 +27,7 @@ from sauna.core.types import Array, Hypers, Rollout, TrainState
 from sauna.core.update import UpdateMetrics, init_state, learn
 from sauna.envs.jax_env import JaxEnv
 from sauna.machines import shared_over
-from sauna.selection.filters import make_filter
+from sauna.selection.filters import make_filter, scheduled
 from sauna.selection.vex import VexTarget, make_target
 from sauna.spaces import Spaces
 
@@ -151,12 +151,11 @@ def learn_from(
 
 def _hypers_now(config: Config, setting: Setting, used: Array, iteration: Array) -> Hypers:
     """A member's hyperparameters in this iteration: the schedule and the drop rate applied."""
-    left = jnp.float32(1.0)
-    if config.learning_rate_schedule == "linear":
-        left = 1.0 - used.astype(jnp.float32) / setting.steps
+    left, rate = 1.0 - used.astype(jnp.float32) / setting.steps, setting.hypers.learning_rate
     rates = setting.drop_rates
     return setting.hypers._replace(
-        learning_rate=setting.hypers.learning_rate * left,
+        learning_rate=rate * left if config.learning_rate_schedule == "linear" else rate,
+        threshold=scheduled(setting.hypers.threshold, config.threshold_schedule, left),
         drop_rate=rates[jnp.minimum(iteration, len(rates) - 1)],
     )
 

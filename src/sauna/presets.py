@@ -92,8 +92,9 @@ FIXED: dict[str, tuple[str, ...]] = {
 
 # Rules of the experiment rather than of the filter: an unfiltered arm beside a filtered one takes
 # them over, so that only the filter differs.
-_SHARED_RULES = ("vex_target", "filter", "history", "decision", "dropped", "max_env_steps_factor",
-                 "gae_over", "truncation", "budget")  # fmt: skip
+_SHARED_RULES = ("vex_target", "filter", "threshold_schedule", "keep_rate_target", "history",
+                 "decision", "dropped", "max_env_steps_factor", "gae_over", "truncation",
+                 "budget")  # fmt: skip
 
 
 class Member(NamedTuple):

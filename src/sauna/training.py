@@ -27,6 +27,7 @@ from sauna.errors import SaunaError
 from sauna.member_state import Counters, pack_member, unpack_member
 from sauna.metrics.rows import metrics_row
 from sauna.presets import Member
+from sauna.selection.filters import scheduled
 from sauna.spaces import Spaces
 
 Arrays = dict[str, np.ndarray]
@@ -175,10 +176,13 @@ def hypers_now(own: Config, drop_rates: list[float], counters: Counters, iterati
       drop_rates: of each iteration; empty: the config's constant one.
     """
     used = counters.kept_steps if own.budget == "kept" else counters.env_steps
-    left = 1.0 - used / own.steps if own.learning_rate_schedule == "linear" else 1.0
+    left = 1.0 - used / own.steps
     rate = drop_rates[min(iteration, len(drop_rates) - 1)] if drop_rates else own.drop_rate
     values = {name: getattr(own, name) for name in Hypers._fields}
-    values |= {"learning_rate": own.learning_rate * left, "drop_rate": rate}
+    values["drop_rate"] = rate
+    values["threshold"] = scheduled(own.threshold, own.threshold_schedule, left)
+    if own.learning_rate_schedule == "linear":
+        values["learning_rate"] = own.learning_rate * left
     return Hypers(**{name: np.float32(value) for name, value in values.items()})  # type: ignore[arg-type]
 
 

@@ -13,6 +13,7 @@ from sauna.core import a2c
 from sauna.core.losses import Losses, combine, standardize, value_error, weighted_mean
 from sauna.core.policy import Policy
 from sauna.core.types import Array, Batch, Hypers, Rollout, TrainState
+from sauna.selection.filters import threshold_held
 from sauna.selection.vex import VexTarget
 
 
@@ -34,6 +35,7 @@ class UpdateMetrics(NamedTuple):
     vex_mean: Array  # of the head's predictions over all env steps
     vex_spread: Array  # their standard deviation
     vex_median: Array
+    threshold: Array  # where it moves: that of this iteration; else NaN
     finite: Array  # bool: parameters and losses are finite
 
 
@@ -169,6 +171,15 @@ def head_statistics(vex: Array, valid: Array) -> tuple[Array, Array, Array]:
     return mean, spread, median
 
 
+def moved_threshold(rollout: Rollout, hypers: Hypers, config: Config) -> Array:
+    """The threshold of this iteration; NaN where it is the config's own, or nothing is filtered."""
+    unmoved = jnp.float32(jnp.nan)
+    if config.keep_rate_target:
+        held = threshold_held(rollout.vex, rollout.valid, config.keep_rate_target)
+        return jnp.where(hypers.threshold > 0, held, unmoved)
+    return unmoved if config.threshold_schedule == "constant" else jnp.float32(hypers.threshold)
+
+
 def learn(
     state: TrainState,
     rollout: Rollout,
@@ -197,6 +208,7 @@ def learn(
         variance_explained(batch.return_, batch.value, batch.weight),
         mean_target,
         *head_statistics(rollout.vex, rollout.valid),
+        moved_threshold(rollout, hypers, config),
         finite,
     )
     return state, metrics

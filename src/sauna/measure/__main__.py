@@ -2,8 +2,9 @@
 
     python -m sauna.measure < settings
 
-The first line of standard input holds, as JSON, what is measured (`noise`), the run, the member's
-name, the checkpoints' numbers, and the file that each measurement is written to. What is written
+The first line of standard input holds, as JSON, what is measured (`noise`, `dial`), the run, the
+member's name, the checkpoints' numbers, and the file that each measurement is written to; for
+`dial` also the run, the member and the checkpoint whose normaliser is the scale. What is written
 is whole, so that a process that is stopped loses only the checkpoint it was at. The end of standard
 input means that whoever asked is gone: the process ends. Mistakes are told as JSON lines.
 """
@@ -25,16 +26,21 @@ from sauna.worker import configure_jax
 def measure(given: dict[str, Any]) -> None:
     """Makes every measurement whose file is not there yet."""
     configure_jax()
-    from sauna.measure.noise import measure as noise
+    from sauna.measure import coverage, noise
     from sauna.measure.streams import load_standing
 
-    what = {"noise": noise}[given["what"]]
+    scale = given.get("scale")
+    scale = scale and load_standing(Path(scale["run"]), scale["member"], scale["iteration"])
     for iteration, file in zip(given["iterations"], given["files"], strict=True):
         if Path(file).exists():
             continue
         standing = load_standing(Path(given["run"]), given["member"], iteration)
-        found = {"iteration": iteration, "env_steps": standing.env_steps, **what(standing)}
-        rundir.write_json(Path(file), found)
+        if given["what"] == "noise":
+            found = noise.measure(standing)
+        else:
+            found = coverage.measure(standing, scale)
+        place = {"iteration": iteration, "env_steps": standing.env_steps}
+        rundir.write_json(Path(file), {**place, **found})
 
 
 def main() -> int:

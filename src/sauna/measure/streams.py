@@ -84,8 +84,14 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     )  # fmt: skip
 
 
-def fresh_streams(standing: Standing, number: int, rollouts: int) -> list[Stream]:
-    """`number` independent streams of `rollouts` rollouts; the same for the same checkpoint."""
+def fresh_streams(
+    standing: Standing, number: int, rollouts: int, limit: int | None = None
+) -> list[Stream]:
+    """`number` independent streams of `rollouts` rollouts; the same for the same checkpoint.
+
+    Args:
+      limit: env steps that each env tries in a rollout at most; by default as in training.
+    """
     config = standing.config
     roots = np.random.SeedSequence([FRESH, standing.member.seed, standing.iteration])
     random = np.random.default_rng(roots)
@@ -104,7 +110,7 @@ def fresh_streams(standing: Standing, number: int, rollouts: int) -> list[Stream
         _put_moments(collector, standing)
         collector.collect(params, hypers, 0, random.integers(0, config.rollout_steps, number))
         parts: list[list[Stream]] = [[] for _ in seeds]
-        whole = np.full(number, capacity(config))
+        whole = np.full(number, limit or capacity(config))
         advantages = jax.jit(
             partial(advantages_over_all, bootstrap_truncated=config.truncation == "bootstrap")
         )

@@ -125,6 +125,80 @@ def sauna_joint(history: str, quota: int) -> Filter:
     return Filter(init, keep)
 
 
+class Held(NamedTuple):
+    """What a held keep rate looks back on, for each env."""
+
+    history: History  # of |Vex|
+    kept: Array  # [N] int32
+
+
+SETTLE = 50  # env steps within which a deviation of the keep rate is made good
+
+
+def sauna_at_rate(rate: float) -> Filter:
+    """Eq. 7 with a threshold that is moved at every step so that the share `rate` is kept.
+
+    Comparing `|x| / |median|` with a threshold is comparing `|x|` with some quantile of the earlier
+    `|x|` of the rollout. The quantile is what is set: with n earlier steps, of which `kept` were
+    kept, its level is
+
+        (1 - rate) + (kept - rate n) / SETTLE
+
+    The first term would do if predictions came in random order; the second, an integral controller,
+    makes good what they do otherwise, within about `SETTLE` steps. Nothing depends on how far apart
+    the predictions are, so this acts where all of them are near 1 and no fixed ratio does. Like the
+    history it begins anew with each rollout; a member whose `threshold` is 0 keeps everything.
+    """
+
+    def init(num_envs: int, capacity: int) -> Held:
+        return Held(empty_history((num_envs,), capacity), jnp.zeros(num_envs, jnp.int32))
+
+    def keep(
+        state: Held, observation: Array, vex: Array, key: Array, hypers: Hypers
+    ) -> tuple[Held, Array]:
+        size, number = jnp.abs(vex), state.history.number
+        level = (1.0 - rate) + (state.kept - rate * number) / SETTLE
+        least = quantile(state.history.ordered, number, level)
+        mask = ~(size < least) | (hypers.threshold <= 0)
+        return Held(insert(state.history, size), state.kept + mask), mask
+
+    return Filter(init, keep)
+
+
+def quantile(ordered: Array, number: Array, level: Array) -> Array:
+    """The value that a further one of the same kind falls short of with the chance `level`.
+
+    Among n + 1 values in random order each rank is as likely, so it is the one of rank
+    `floor(level (n + 1))` of n, counted from 1: -inf for rank 0, +inf behind the last.
+
+    Args:
+      ordered: `[..., >= number]`, rising, +inf behind the first `number` `[...]`.
+      level: `[...]`.
+    """
+    rank = jnp.floor(level * (number + 1)).astype(jnp.int32)
+    place = jnp.clip(rank - 1, 0, ordered.shape[-1] - 1)
+    found = jnp.take_along_axis(ordered, place[..., None], -1)[..., 0]
+    return jnp.where(rank < 1, -jnp.inf, jnp.where(rank > number, jnp.inf, found))
+
+
+def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
+    """The threshold when the share `left` of the budget is left."""
+    return {"constant": threshold, "rising": threshold * (1.0 - left),
+            "falling": threshold * left}[schedule]  # fmt: skip
+
+
+def threshold_held(vex: Array, valid: Array, rate: float) -> Array:
+    """The threshold of eq. 7 that would keep the share `rate` of a rollout's steps `[S, N]`."""
+    number = jnp.sum(valid)
+
+    def ordered(x: Array) -> Array:
+        return jnp.sort(jnp.where(valid, x, jnp.inf).ravel())
+
+    middle = median(History(ordered(vex), number))
+    least = quantile(ordered(jnp.abs(vex)), number, jnp.float32(1.0 - rate))
+    return jnp.maximum(least, 0.0) / (jnp.abs(middle) + EPSILON)
+
+
 def random_drop() -> Filter:
     """Drops each step with probability `drop_rate`, whatever the head says: a control."""
 
@@ -146,6 +220,8 @@ def make_filter(config: Config) -> Filter | None:
         return None
     if config.filter == "random-drop":
         return random_drop()
+    if config.filter == "sauna" and config.keep_rate_target:
+        return sauna_at_rate(config.keep_rate_target)
     if config.filter == "sauna":
         rule = sauna_joint if config.decision == "joint" else sauna_per_env
         return rule(config.history, config.rollout_steps)
