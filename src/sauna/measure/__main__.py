@@ -29,7 +29,7 @@ def measure(given: dict[str, Any]) -> None:
     from sauna.measure import coverage, noise
     from sauna.measure.streams import load_standing
 
-    scale = given.get("scale")
+    scale: Any = given.get("scale")
     scale = scale and load_standing(Path(scale["run"]), scale["member"], scale["iteration"])
     for iteration, file in zip(given["iterations"], given["files"], strict=True):
         if Path(file).exists():

@@ -185,8 +185,8 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
 
 def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
     """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
+    from sauna.study import dial, noise
     from sauna.study.figures import NOTHING
-    from sauna.study.noise import extra as noise
     from sauna.study.report import write_report
 
     results = gather(spec, units, folder, command)
@@ -195,9 +195,9 @@ def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str
     rundir.write_json(place / "summary.json", summary)
     extra = NOTHING
     if spec.measure:
-        measured = gather_measured(spec, units, folder, place)
+        measured = gather_measured(spec, units, folder, place, results)
         rundir.write_json(place / f"{spec.measure}.json", measured)
-        extra = {"noise": noise}[spec.measure](measured)
+        extra = {"noise": noise.extra, "dial": dial.extra}[spec.measure](measured)
     write_report(results, summary, place, extra)
     return summary
 

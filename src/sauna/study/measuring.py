@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import json
 import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from sauna import rundir
 from sauna.checkpoint import numbered
 from sauna.study.process import Message, UnitProcess
 from sauna.study.spec import Spec, check, drops_nothing
+from sauna.study.statistics import area_under_curve
 from sauna.study.units import Unit, parts
 
 POINTS = (0.05, 0.25, 0.5, 0.75, 1.0)  # shares of the budget that are nearest to a checkpoint
+SETTINGS = ("threshold", "threshold_schedule", "keep_rate_target")  # that a cell is known by
 
 
 class Item(NamedTuple):
@@ -74,6 +78,18 @@ def checkpoints_at(run: Path, seed: int, steps: int) -> dict[float, int]:
     return chosen
 
 
+def scale_of(spec: Spec, items: list[Item], task: str) -> dict[str, Any] | None:
+    """Whose normaliser scales the observations of all arms: the baseline's first member at its end.
+
+    None while that is not trained.
+    """
+    for item in items:
+        if (item.task, item.label) == (task, spec.baseline) and item.iterations:
+            last = max(item.iterations)
+            return {"run": str(item.run), "member": f"{item.arm}/{item.seed}", "iteration": last}
+    return None
+
+
 def measure(
     spec: Spec,
     units: list[Unit],
@@ -87,7 +103,12 @@ def measure(
 
     A member whose measurement fails is told and left out; running the study again tries it again.
     """
-    waiting = [item for item in items_of(spec, units, folder, place) if not item.is_done]
+    items = list(items_of(spec, units, folder, place))
+    scales = {}
+    if spec.measure == "dial":
+        scales = {task: scale_of(spec, items, task) for task in spec.tasks}
+        items = [item for item in items if scales[item.task]]
+    waiting = [item for item in items if not item.is_done]
     if not waiting or stopping():
         return
     (place / str(spec.measure)).mkdir(exist_ok=True)
@@ -100,7 +121,7 @@ def measure(
                 return
             while waiting and len(running) < jobs:
                 item = waiting.pop(0)
-                running[item.files[0]] = _start(spec, item, place, messages)
+                running[item.files[0]] = _start(spec, item, scales.get(item.task), place, messages)
             try:
                 item, message = messages.get(timeout=0.2)
             except queue.Empty:
@@ -121,7 +142,11 @@ def _named(item: Item) -> str:
 
 
 def _start(
-    spec: Spec, item: Item, place: Path, messages: queue.SimpleQueue[tuple[Item, Message | None]]
+    spec: Spec,
+    item: Item,
+    scale: dict[str, Any] | None,
+    place: Path,
+    messages: queue.SimpleQueue[tuple[Item, Message | None]],
 ) -> UnitProcess:
     given = {
         "what": spec.measure,
@@ -129,6 +154,7 @@ def _start(
         "member": f"{item.arm}/{item.seed}",
         "iterations": item.iterations,
         "files": [str(file) for file in item.files],
+        "scale": scale,
     }
     log = place / str(spec.measure) / "stderr.txt"
     return UnitProcess(
@@ -136,21 +162,47 @@ def _start(
     )
 
 
-def gather_measured(spec: Spec, units: list[Unit], folder: Path, place: Path) -> dict[str, Any]:
-    """What has been measured so far: a cell per task and label, in it members and their points."""
-    cells: dict[tuple[str, str], dict[str, Any]] = {}
-    for item in sorted(
-        items_of(spec, units, folder, place), key=lambda i: spec.tasks.index(i.task)
-    ):
-        empty = {"task": item.task, "label": item.label, "arm": item.arm, "members": []}
-        cell = cells.setdefault((item.task, item.label), empty)
-        points = [
+def gather_measured(
+    spec: Spec, units: list[Unit], folder: Path, place: Path, results: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What has been measured so far, beside the numbers of `results` that it is set against.
+
+    Every cell of `results` is there, and of each complete member its `points`.
+    """
+    points: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for item in items_of(spec, units, folder, place):
+        points[item.task, item.label, item.seed] = [
             {"point": point, **json.loads(file.read_text())}
             for point, file in zip(item.points, item.files, strict=True)
             if file.exists()
         ]
-        cell["members"].append({"seed": item.seed, "points": points})
-    steps = {arm.label: check(arm, arm.tasks[0]).steps for arm in spec.arms}
-    for cell in cells.values():
-        cell["steps"] = steps[cell["label"]]
-    return {"name": spec.name, "measure": spec.measure, "cells": list(cells.values())}
+    arms = {arm.label: arm for arm in spec.arms}
+    cells = []
+    for cell in results["cells"]:
+        key, config = (cell["task"], cell["label"]), cell["config"]
+        members = [
+            {
+                "seed": member["seed"],
+                **{name: member[name] for name in ("keep_rate", "final_return", "env_steps")},
+                **{name: mean_of(member["curve"], name) for name in ("entropy", "threshold")},
+                "points": points[*key, member["seed"]],
+            }
+            for member in cell["members"]
+            if (*key, member["seed"]) in points
+        ]
+        if members:
+            settings = {name: config[name] for name in SETTINGS}
+            cells.append(
+                {"task": key[0], "label": key[1], "arm": cell["arm"], "steps": config["steps"],
+                 "rates_of": arms[key[1]].rates_of, "config": settings, "members": members}
+            )  # fmt: skip
+    return {
+        "name": spec.name, "command": results["command"], "measure": spec.measure, "cells": cells,
+        **{name: results[name] for name in ("versions", "machine", "git")},
+    }  # fmt: skip
+
+
+def mean_of(curve: Mapping[str, Any], name: str) -> float | None:
+    """A curve's mean over training; None where it has no values."""
+    values = np.array(curve.get(name) or [None] * len(curve["env_steps"]), float)
+    return area_under_curve(np.array(curve["env_steps"], float), values)

@@ -125,6 +125,7 @@ def _curve(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
     chosen = np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int)).tolist()
     thinned = [rows[i] for i in chosen] if rows else []
     curve: dict[str, list[Any]] = {"env_steps": [row["env_steps"] for row in thinned]}
-    for name in CURVES:
+    moved = ("threshold",) if any("threshold" in row for row in thinned) else ()
+    for name in (*CURVES, *moved):
         curve[name] = [float(f"{row[name]:.{DIGITS}g}") if name in row else None for row in thinned]
     return curve

@@ -15,7 +15,7 @@
 
 Any setting of a run may stand at the top, for all arms, or in an arm. `baseline` is the label that
 others are compared with. `measure` names what is measured of the trained members at checkpoints
-along their training (`noise`). An arm may name its own `tasks`, `seeds` and `baseline`; a
+along their training (`noise`, `dial`). An arm may name its own `tasks`, `seeds` and `baseline`; a
 `random-drop` arm repeats the measured drop rates of the arm `rates_of`.
 """
 
@@ -38,7 +38,7 @@ from sauna.presets import ARMS, FIXED, arm_config, parse_all, resolve
 _OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard", "distributed")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
-MEASURES = ("noise",)
+MEASURES = ("noise", "dial")
 _ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
 
 
@@ -163,6 +163,8 @@ def _check_measure(measure: Any, configs: list[Config]) -> None:
                            "checkpoint_every = 10 and keep_checkpoints = 1000")  # fmt: skip
         if config.backend == "device":
             raise BadInput("backend: measure needs environments on the host")
+        if measure == "dial" and not config.normalize_observations:
+            raise BadInput("normalize_observations: dial takes its scale from the normaliser")
     if measure == "noise" and all(map(drops_nothing, configs)):
         raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
 

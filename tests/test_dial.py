@@ -1,0 +1,137 @@
+"""The threshold as a dial: coverage where it is known, verdicts, and a study from its file."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers import environment
+from sauna.errors import BadInput
+from sauna.measure.coverage import particle_entropy
+from sauna.study.dial import correlation, extra, marks, text_table, verdicts
+from sauna.study.measuring import POINTS
+from sauna.study.spec import load_spec, read_spec
+
+
+def test_coverage_is_the_entropy_of_what_is_known() -> None:
+    random = np.random.default_rng(0)
+    normal = random.normal(size=(3000, 3)) * [1.0, 2.0, 0.5]
+    assert abs(particle_entropy(normal) - 1.5 * math.log(2 * math.pi * math.e)) < 0.1
+    uniform = random.uniform(size=(3000, 2)) * [4.0, 2.0]
+    assert abs(particle_entropy(uniform) - math.log(8.0)) < 0.1
+    twice = particle_entropy(2 * normal) - particle_entropy(normal)
+    assert twice == pytest.approx(3 * math.log(2))
+    assert math.isfinite(particle_entropy(np.zeros((50, 2))))  # all in one place
+
+
+def cell(label: str, values: list[float], **settings: Any) -> dict[str, Any]:
+    """Members whose entropy and coverage are `values`, and their returns the negative."""
+    config = {"threshold": 0.3, "threshold_schedule": "constant", "keep_rate_target": 0.0}
+    own = {"task": "A-v0", "label": label, "arm": "sauna", "rates_of": None}
+    own |= {key: settings.pop(key) for key in list(settings) if key in own}
+    members = [
+        {"seed": seed, "keep_rate": 0.5, "final_return": -x, "entropy": x, "threshold": 0.9,
+         "points": [{"point": 1.0, "coverage": x}]}
+        for seed, x in enumerate(values)
+    ]  # fmt: skip
+    return {**own, "config": {**config, **settings}, "members": members}
+
+
+def study(*cells: dict[str, Any]) -> dict[str, Any]:
+    return {"cells": list(cells)}
+
+
+RISING = [cell(str(t), [t, t + 0.1, t - 0.1], threshold=t) for t in (0.0, 0.5, 1.0)]
+
+
+def test_a_dial_is_found_where_there_is_one_and_only_there() -> None:
+    assert "moves exploration against return" in verdicts(study(*RISING))[0]
+    assert "entropy rises (rank correlation 0.9" in verdicts(study(*RISING))[0]
+    random = np.random.default_rng(0)
+    found = 0
+    for _ in range(20):
+        flat = [cell(str(t), random.normal(size=4).tolist(), threshold=t) for t in (0, 0.5, 1)]
+        found += "no evidence that the threshold is a dial" not in verdicts(study(*flat))[0]
+    assert found <= 2
+    assert "no answer yet" in verdicts(study(*RISING[:2]))[0]
+
+
+def test_the_p_value_is_that_of_all_deals() -> None:
+    few = [cell(str(t), [float(t)], threshold=t) for t in (0.0, 1.0, 2.0, 3.0)]
+    rho, p, number = correlation(marks(study(*few), "A-v0"), "entropy") or (0, 0, 0)
+    assert (rho, number) == (pytest.approx(1.0), 4)
+    assert p == pytest.approx(2 / math.factorial(4), abs=0.01)
+
+
+def test_every_arm_stands_at_its_threshold() -> None:
+    others = [
+        cell("0 to 1", [0.5], threshold=1.0, threshold_schedule="rising"),
+        cell("keeps half", [0.7], keep_rate_target=0.5),
+        cell("coin", [0.1], arm="random-drop", rates_of="0.5"),
+    ]
+    found = {mark.label: mark for mark in marks(study(*RISING, *others), "A-v0")}
+    assert {label: mark.threshold for label, mark in found.items()} == {
+        "0.0": 0.0, "0.5": 0.5, "1.0": 1.0, "0 to 1": 0.9, "keeps half": 0.9, "coin": 0.5,
+    }  # fmt: skip
+    assert [found[x].kind for x in ("0 to 1", "keeps half")] == ["scheduled", "held keep rate"]
+    page = extra(study(*RISING, *others))
+    assert [plot.name for plot in page.plots] == [
+        "dial_keep_rate", "dial_entropy", "dial_coverage", "dial_final_return",
+    ]  # fmt: skip
+    assert len(page.plots[1].panels[0].lines) == 4
+    assert len(text_table(study(*RISING, *others))) == 7
+
+
+def test_the_scale_needs_a_normaliser() -> None:
+    spec = {"tasks": ["A-v0"], "arms": [{"label": "sauna"}], "measure": "dial",
+            "checkpoint_every": 10, "keep_checkpoints": 1000}  # fmt: skip
+    assert read_spec(spec).measure == "dial"
+    with pytest.raises(BadInput, match="normalize_observations: dial"):
+        read_spec({**spec, "normalize_observations": False})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["noise", "dial"])
+def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> None:
+    """The built-in study's arms, on a small task; run again it measures nothing again."""
+    text = {**load_spec(name).text, "name": "small", "tasks": ["InvertedPendulum-v5"]}
+    text |= {"seeds": 2, "steps": 8192, "rollout_steps": 512, "minibatches": 16, "hidden": [8, 8],
+             "epochs": 2, "checkpoint_every": 1}  # fmt: skip
+    lines = []
+    for key, value in text.items():
+        if key != "arms":
+            lines.append(f"{key} = {json.dumps(value)}")
+    for arm in text["arms"]:
+        lines += ["[[arms]]", *(f"{key} = {json.dumps(value)}" for key, value in arm.items())]
+    (tmp_path / "small.toml").write_text("\n".join(lines))
+    command = [sys.executable, "-m", "sauna", "study", "small.toml"]
+
+    def run() -> str:
+        done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True,
+                              text=True)  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "measuring" in run()
+    place = tmp_path / "runs" / "small"
+    files = {path: path.stat().st_mtime_ns for path in (place / name).glob("*.json")}
+    arms = len(text["arms"])
+    assert len(files) == arms * 2 * len(POINTS)
+    assert "measuring" not in run()
+    assert files == {path: path.stat().st_mtime_ns for path in files}
+    measured = json.loads((place / f"{name}.json").read_text())
+    assert all(len(m["points"]) == len(POINTS) for c in measured["cells"] for m in c["members"])
+    page = (place / "report.html").read_text()
+    assert 'id="measured"' in page and f"{name}_" in page
+    if name == "dial":
+        held = [c for c in measured["cells"] if c["config"]["keep_rate_target"]]
+        for c in held:
+            for member in c["members"]:
+                assert abs(member["keep_rate"] - c["config"]["keep_rate_target"]) < 0.05
