@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from sauna.study.figures import write_figures
+from sauna.study import dial, noise
+from sauna.study.figures import draw_plots, write_figures
+from sauna.study.report import rounded
 from sauna.study.results import gather
 from sauna.study.spec import load_spec
 from sauna.study.summary import summarize
@@ -28,6 +30,7 @@ from sauna.study.units import units_of
 
 ROOT = Path(__file__).parent.parent
 STUDIES = ("fig3", "cheetah30", "release")
+MEASURED = {"noise": noise, "dial": dial}  # what `docs/why.md` tells
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
 POINTS = 30  # of each curve that are committed
 SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8")  # in the README's figure
@@ -74,6 +77,14 @@ def _thinned(cell: dict[str, Any]) -> dict[str, Any]:
         chosen = np.unique(np.linspace(0, number - 1, POINTS).astype(int)).tolist()
         member["curve"] = {key: [curve[key][i] for i in chosen] for key in ("env_steps", *CURVES)}
     return {**cell, "members": members}
+
+
+def collect_measured(name: str) -> None:
+    """`results/NAME.json`: what a study has measured of its members so far, to five digits."""
+    path = ROOT / "runs" / name / f"{name}.json"
+    if path.exists():
+        text = json.dumps(rounded(json.loads(path.read_text())), separators=(",", ":"))
+        (ROOT / "results" / path.name).write_text(text.replace('{"task"', '\n{"task"') + "\n")
 
 
 def load(name: str) -> dict[str, Any] | None:
@@ -183,6 +194,34 @@ def _missing(name: str, results: dict[str, Any]) -> str:
     return f"Not trained to the end yet: {'; '.join(missing)}." if missing else ""
 
 
+def why() -> str:
+    """`docs/why.md`, all of it from the result files; its figures are drawn on the way."""
+    parts = ["# Why it works, or does not", "Made by `python results/make.py`, as "
+             "[results.md](results.md) is. What is measured, and how, is told in "
+             "[studies.md](studies.md#measurements)."]  # fmt: skip
+    for name, study in MEASURED.items():
+        parts.append(f"## {study.TITLE}")
+        measured = load(name)
+        if measured is None or not measured["cells"]:
+            parts.append(f"Not measured yet: `sauna study {name}`.")
+            continue
+        extra = study.extra(measured)
+        drawn = draw_plots(extra.plots, extra.looks, ROOT / "docs" / "why")
+        parts.append(f"`{measured['command']}`")
+        parts.append("\n".join(f"- {text}" for text in study.verdicts(measured)))
+        parts += [f"![{p.title}](why/figures/{p.name}.png)\n\n{p.caption}" for p in extra.plots]
+        parts.append(_markdown(study.text_table(measured)))
+        parts.append(study.ABOUT)
+        for path in drawn.values():
+            path.unlink()  # the picture is enough here
+    return "\n\n".join(parts) + "\n"
+
+
+def _markdown(rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
 def insert(path: Path, name: str, text: str) -> None:
     """Puts `text` between the markers `NAME` of a Markdown file."""
     begin, end = f"<!-- {name} begin -->", f"<!-- {name} end -->"
@@ -209,6 +248,12 @@ def main() -> None:
             train(name)
         if "--train" in sys.argv or "--collect" in sys.argv:
             collect(name)
+    for name in MEASURED:
+        if "--train" in sys.argv:
+            train(name)
+        if "--train" in sys.argv or "--collect" in sys.argv:
+            collect_measured(name)
+    (ROOT / "docs" / "why.md").write_text(why())
     (ROOT / "docs" / "results.md").write_text(document())
     results = load("fig3")
     if results is not None:

@@ -151,7 +151,7 @@ def _train(
             executor(folder, jobs, view, lambda: bool(noted)).run(units)
             view.close()
             if spec.measure:
-                measure(spec, units, folder, place, jobs, say, lambda: bool(noted))
+                measure(spec, units, folder, place, min(jobs, cores()), say, lambda: bool(noted))
         finally:
             view.close()
             held.close()

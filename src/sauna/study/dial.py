@@ -36,7 +36,7 @@ QUANTITIES = (
 ASKED = ("entropy", "coverage", "final_return")
 ABOUT = (
     "Against the threshold: keep rate, entropy of the policy, coverage of states, return. Of arms "
-    "whose threshold moves the mean over training is shown. Rank correlations are over the members "
+    "whose threshold moves its median over training is shown. Rank correlations are over members "
     "of arms with a constant threshold, p by dealing their thresholds out at random, after Holm's "
     "correction for the three quantities of a task. Fewer kept steps are also fewer updates in the "
     "same env steps: arms that drop as much by coin show what that alone does."
@@ -50,7 +50,7 @@ class Mark(NamedTuple):
 
     kind: str  # of `LOOKS`
     label: str
-    threshold: float  # mean over members and training
+    threshold: float  # where it moves, the mean over members of its median over training
     members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
 
 
@@ -120,7 +120,7 @@ def over_members(mark: Mark, key: str) -> Estimate:
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
     """The head, and a row for each task and arm."""
     names = [title for _, _, title, _ in QUANTITIES]
-    rows = [["Task", "Arm", "Members", "Threshold, mean", *names]]
+    rows = [["Task", "Arm", "Members", "Threshold", *names]]
     for task in tasks_of(measured):
         for mark in marks(measured, task):
             number = str(len(mark.members["final_return"]))

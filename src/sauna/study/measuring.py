@@ -99,7 +99,7 @@ def measure(
     say: Callable[[str], None],
     stopping: Callable[[], bool],
 ) -> None:
-    """Makes what is missing of a study's measurements, `jobs` members at a time.
+    """Makes what is missing of a study's measurements, `jobs` members at a time on this machine.
 
     A member whose measurement fails is told and left out; running the study again tries it again.
     """
@@ -127,7 +127,8 @@ def measure(
             except queue.Empty:
                 continue
             if message is not None:
-                say(f"{_named(item)}: {message['error']}")
+                if "error" in message:
+                    say(f"{_named(item)}: {message['error']}")
                 continue
             how = running.pop(item.files[0]).end()
             say(f"{_named(item)}: {'measured' if item.is_done else how}")
@@ -184,7 +185,8 @@ def gather_measured(
             {
                 "seed": member["seed"],
                 **{name: member[name] for name in ("keep_rate", "final_return", "env_steps")},
-                **{name: mean_of(member["curve"], name) for name in ("entropy", "threshold")},
+                "entropy": mean_over_training(member["curve"], "entropy"),
+                "threshold": usual(member["curve"], "threshold"),
                 "points": points[*key, member["seed"]],
             }
             for member in cell["members"]
@@ -202,7 +204,17 @@ def gather_measured(
     }  # fmt: skip
 
 
-def mean_of(curve: Mapping[str, Any], name: str) -> float | None:
-    """A curve's mean over training; None where it has no values."""
-    values = np.array(curve.get(name) or [None] * len(curve["env_steps"]), float)
-    return area_under_curve(np.array(curve["env_steps"], float), values)
+def mean_over_training(curve: Mapping[str, Any], name: str) -> float | None:
+    """A curve's mean over env steps; None where it has no values."""
+    return area_under_curve(np.array(curve["env_steps"], float), _values(curve, name))
+
+
+def usual(curve: Mapping[str, Any], name: str) -> float | None:
+    """A curve's median: a held threshold is far off where the median prediction is near 0."""
+    values = _values(curve, name)
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
+
+
+def _values(curve: Mapping[str, Any], name: str) -> np.ndarray:
+    return np.array(curve.get(name) or [None] * len(curve["env_steps"]), float)

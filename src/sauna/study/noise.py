@@ -30,17 +30,16 @@ ABOUT = (
     "where the group's gradient is biased, not only noisy. In brackets: 95% over members, each the "
     "mean of its checkpoints; not corrected for the number of comparisons."
 )
-# key in the figures, title, caption, y axis
-_PLOTS = (
+# key in the figures, title, caption, y axis, its limits
+_PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
     ("snr", "Signal to noise of a minibatch", "Squared length of the group's mean gradient over "
-     "the trace of its covariance.", "signal to noise"),
+     "the trace of its covariance.", "signal to noise", None),
     ("cosine", "Cosine to the gradient of a large batch", "Mean cosine of a minibatch's gradient "
-     "and that of all steps of an independent large batch.", "cosine"),
+     "and that of all steps of an independent large batch.", "cosine", (-1.0, 1.0)),
 )  # fmt: skip
 HEAD = ("Task", "Arm", "Members", "Keep rate", "SNR kept", "SNR coin", "SNR dropped",
         "SNR dropped - coin", "SNR dropped - shifted", "SNR per env step, kept - coin",
         "Cosine dropped - coin", "Alignment of kept")  # fmt: skip
-Value = Sequence[float | None]
 
 
 def extra(measured: Mapping[str, Any]) -> Extra:
@@ -157,13 +156,13 @@ def plots(measured: Mapping[str, Any]) -> list[Plot]:
     """Signal to noise and cosine of each group along training, a panel for each task and arm."""
     cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
     found = []
-    for key, title, caption, label in _PLOTS:
+    for key, title, caption, label, limits in _PLOTS:
         panels = [
             Panel(f"{cell['task']}, {cell['label']}", [_line(cell, g, key) for g in GROUPS])
             for cell in cells
         ]
         text = f"{caption} Line: mean of the members; band: 95% interval."
-        found.append(Plot(f"noise_{key}", title, text, "env steps", label, None, panels))
+        found.append(Plot(f"noise_{key}", title, text, "env steps", label, limits, panels))
     return found if cells else []
 
 
