@@ -23,6 +23,7 @@ import scipy
 from sauna.measure.streams import Standing, fresh_streams
 
 STREAMS = 8
+STEPS = 2048  # env steps of each env in a stream, at least
 EVERY = 8  # env steps between two observations that are counted
 NEIGHBOUR = 5  # K
 
@@ -34,7 +35,7 @@ def measure(standing: Standing, scale: Standing) -> dict[str, Any]:
       scale: the member whose normaliser, as it was there, scales the observations.
     """
     steps = standing.config.rollout_steps
-    streams = fresh_streams(standing, STREAMS, 1, limit=steps)
+    streams = fresh_streams(standing, STREAMS, -(-STEPS // steps), limit=steps)
     mean, variance = (scale.arrays[f"observation_moments/{n}"] for n in ("mean", "variance"))
     seen = np.concatenate([stream.seen[::EVERY] for stream in streams])
     return {

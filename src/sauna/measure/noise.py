@@ -29,7 +29,7 @@ from sauna.measure.estimates import Gradients, estimate
 from sauna.measure.streams import Standing, Stream, fresh_streams
 
 STREAMS = 64  # half of them are the reference
-ROLLOUTS = 2  # of each stream
+STEPS = 4096  # kept ones that the rollouts of a stream have room for, at least
 MINIBATCHES = 64  # of each group and stream
 LEAST_STREAMS = 8  # with enough steps of every group, below which nothing is estimated
 GROUPS = ("kept", "dropped", "coin", "shifted")
@@ -37,7 +37,7 @@ PAIRS = (("dropped", "coin"), ("kept", "coin"), ("dropped", "shifted"))
 RULES = {"standardized": True, "raw": False}
 
 
-def measure(standing: Standing, streams: int = STREAMS, rollouts: int = ROLLOUTS) -> dict[str, Any]:
+def measure(standing: Standing, streams: int = STREAMS) -> dict[str, Any]:
     """All that is found at a checkpoint, as JSON values.
 
     Under `rules`, `standardized` standardises the advantages of every minibatch (and once those of
@@ -45,8 +45,9 @@ def measure(standing: Standing, streams: int = STREAMS, rollouts: int = ROLLOUTS
     than `LEAST_STREAMS` streams have a minibatch of every group, `rules` is empty.
     """
     config = standing.config
-    size = config.rollout_steps * config.envs // config.minibatches
-    collected = fresh_streams(standing, streams, rollouts)
+    rollout = config.rollout_steps * config.envs
+    size = rollout // config.minibatches
+    collected = fresh_streams(standing, streams, -(-STEPS // rollout))
     reference, tested = collected[: streams // 2], collected[streams // 2 :]
     usable = [stream for stream in tested if _smallest(stream) >= size]
     keep = np.concatenate([stream.keep for stream in collected])

@@ -31,6 +31,7 @@ from sauna.presets import Member, members, stored_config
 from sauna.spaces import Spaces, read_spaces
 from sauna.training import hypers_now
 
+WARM_UP = 2048  # env steps at most that are thrown away, so that no stream begins with a reset
 FRESH = 0x5A07A  # sets the seeds of streams apart from those of training
 
 
@@ -106,9 +107,9 @@ def fresh_streams(
         collector.start()
         params = np.tile(np.asarray(standing.params), (number, 1))
         hypers = [standing.hypers] * number
-        # A random number of steps is thrown away, so that no stream begins with a reset.
         _put_moments(collector, standing)
-        collector.collect(params, hypers, 0, random.integers(0, config.rollout_steps, number))
+        first = _warm_up(collector, params, hypers, random.integers(WARM_UP, size=number),
+                         config.rollout_steps)  # fmt: skip
         parts: list[list[Stream]] = [[] for _ in seeds]
         whole = np.full(number, limit or capacity(config))
         advantages = jax.jit(
@@ -117,7 +118,7 @@ def fresh_streams(
         for i in range(rollouts):
             _put_moments(collector, standing)
             envs.begin(collector.state.observation)
-            collected = collector.collect(params, hypers, i + 1, whole)
+            collected = collector.collect(params, hypers, first + i, whole)
             seen = envs.seen()
             for p, own in enumerate(collected):
                 assert own.rollout is not None
@@ -126,6 +127,22 @@ def fresh_streams(
     finally:
         envs.close()
     return [Stream(*map(np.concatenate, zip(*own, strict=True))) for own in parts]
+
+
+def _warm_up(
+    collector: HostCollector,
+    params: np.ndarray,
+    hypers: list[Hypers],
+    left: np.ndarray,
+    steps: int,
+) -> int:
+    """Acts for `left` `[P]` env steps, `steps` at a time; how many rollouts that took."""
+    rollouts = 0
+    while left.any():
+        now = np.minimum(left, steps)
+        collector.collect(params, hypers, rollouts, now)
+        left, rollouts = left - now, rollouts + 1
+    return rollouts
 
 
 def _put_moments(collector: HostCollector, standing: Standing) -> None:
