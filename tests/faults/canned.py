@@ -18,7 +18,7 @@ from unittest.mock import patch
 import sauna
 from faults.disk import Crash, Hook, Op, watched
 from helpers import SMALL, Recorder, equal, make_job, train_here
-from sauna import checkpoint, rundir
+from sauna import checkpoint, rundir, worker
 from sauna.wire import Shared, Worker, receive, send, start_thread
 from sauna.worker import PipeReporter
 
@@ -72,6 +72,14 @@ def played_back(recorder: Recorder) -> Iterator[None]:
         patch("sauna.rundir.machine", dict),
         patch("os.fsync", lambda descriptor: None),
     ):
+        yield
+
+
+@contextmanager
+def trained_here() -> Iterator[None]:
+    """Runs train in threads of this process, which has imported JAX already."""
+    target = partial(worker.serve, dies_alone=False)
+    with patch("sauna.coordinator.start_worker", lambda module, environment: start_thread(target)):
         yield
 
 

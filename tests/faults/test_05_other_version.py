@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, Trap, played_back, record, until
+from faults.canned import BACKENDS, Trap, played_back, record, trained_here, until
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
@@ -166,7 +166,8 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     assert loaded.checkpoint.manifest["format"] == checkpoint.FORMAT
     spaces = loaded.spaces
     assert sauna.load(run)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
-    sauna.resume(run)
+    with trained_here():
+        sauna.resume(run)
     assert rundir.is_complete(run)
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()

@@ -10,18 +10,29 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import sauna
+from faults.canned import trained_here
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
 from jax_worlds import FIELDS, Poison, poisoned
 from sauna import checkpoint, rundir
+from sauna.collect.device import Faults, collect
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
 from sauna.core.types import Hypers
-from sauna.device_program import Report, init_member, iterate, make_parts, several
+from sauna.device_program import (
+    MemberState,
+    Parts,
+    Report,
+    init_member,
+    iterate,
+    make_parts,
+    several,
+)
 from sauna.device_training import _check_sound, _setting
 from sauna.envs.contract import HostEnvs
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
@@ -55,16 +66,20 @@ def experiment(least: int, seed: int, place: Path) -> Result:
     """
     rng, tally, everything = random.Random(seed), Tally(), cases()
     chosen = everything if least >= 50 else rng.sample(everything, least)
+    _on_the_host(chosen, rng, tally)
+    device = OnDevice()
+    for number, kwargs in enumerate(chosen):
+        device.play(number % ENVS, kwargs, tally)
+    return tally.result()
+
+
+def _on_the_host(chosen: list[dict[str, Any]], rng: random.Random, tally: Tally) -> None:
     for kwargs in chosen:
         _play("in-process", kwargs, tally)
     for kwargs in rng.sample(chosen, max(1, len(chosen) // 10)):
         _play("workers", kwargs, tally)
-    for kwargs in rng.sample(everything, 4 if least >= 50 else 1):
+    for kwargs in rng.sample(cases(), 4 if len(chosen) >= 50 else 1):
         _collect(kwargs, tally)
-    on_device = OnDevice()
-    for number, kwargs in enumerate(chosen):
-        on_device.play(number % ENVS, kwargs, tally)
-    return tally.result()
 
 
 def _play(backend: str, kwargs: dict[str, Any], tally: Tally) -> None:
@@ -145,26 +160,36 @@ class OnDevice:
         config, self._member = plain.config, plain.members[0]
         self._setting = _setting(self._member, [0.0], 1)
 
-        def run(poison: Poison) -> Report:
+        def begin(poison: Poison) -> tuple[Parts, MemberState]:
             parts = make_parts(config, spaces, flat(poisoned(poison)), lambda here: here)
-            state = init_member(parts, self._setting)
+            return parts, init_member(parts, self._setting)
+
+        def run(poison: Poison) -> Report:
+            parts, state = begin(poison)
             return several(partial(iterate, parts), state, self._setting, 0, 3)[1]
 
-        self._run = jax.jit(run)
+        def first_rollout(poison: Poison) -> Faults:
+            parts, state = begin(poison)
+            keys, hypers = self._setting.keys, self._setting.hypers
+            zero, limit = jnp.int32(0), jnp.int32(ROLLOUT)
+            given = (state.learner.params, state.collect, keys, hypers, zero, limit)
+            return collect(parts.collecting, *given)[-1]
+
+        self._run, self.first_rollout = jax.jit(run), jax.jit(first_rollout)
+
+    def poison(self, env: int, episode: int, kwargs: dict[str, Any]) -> Poison:
+        own = jax.random.fold_in(self._setting.keys.env, env)
+        key, field = jax.random.fold_in(own, episode), FIELDS.index(kwargs["field"])
+        return Poison(key, field, float(kwargs["value"]), kwargs["component"], kwargs["step"])
 
     def play(self, env: int, kwargs: dict[str, Any], tally: Tally) -> None:
-        """The first episodes, or ten later: those are in the second rollout."""
+        """The first episodes, or later ones: those are in the second rollout."""
         episode = kwargs["episode"] - 1 if kwargs["episode"] == 1 else kwargs["episode"] + 5
-        own = jax.random.fold_in(self._setting.keys.env, env)
-        field = kwargs["field"]
-        poison = Poison(jax.random.fold_in(own, episode), FIELDS.index(field),
-                        float(kwargs["value"]), kwargs["component"], kwargs["step"])  # fmt: skip
-        reports = jax.device_get(self._run(poison))
+        reports = jax.device_get(self._run(self.poison(env, episode, kwargs)))
         tally.tried += 1
         tally.count("device")
-        at = {"first": 0, "final": LENGTH}.get(field, kwargs["step"]) + LENGTH * episode
-        iteration, row = divmod(max(at - 1, 0), ROLLOUT)
-        what = "reward" if field == "reward" else "observation"
+        iteration, row = divmod(_row(episode, kwargs), ROLLOUT)
+        what = "reward" if kwargs["field"] == "reward" else "observation"
         wanted = (f"environment {env} of ppo/0, iteration {iteration}, step {row} of the rollout: "
                   f"{what} is not finite")  # fmt: skip
         message = "it got through"
@@ -177,15 +202,37 @@ class OnDevice:
             tally.miss(f"device: {kwargs}: says {message!r} instead of {wanted!r}")
 
 
-def test_no_number_that_is_none_is_learned_from(tmp_path: Path) -> None:
-    assert_held(experiment(20, 0, tmp_path), 20)
+def _row(episode: int, kwargs: dict[str, Any]) -> int:
+    """Of the env steps: the one that reached the number, or after which it was begun with."""
+    step = {"first": 0, "final": LENGTH}.get(kwargs["field"], kwargs["step"])
+    return max(LENGTH * episode + step - 1, 0)
+
+
+def test_no_number_that_is_none_is_learned_from() -> None:
+    tally, rng = Tally(), random.Random(0)
+    _on_the_host(rng.sample(cases(), 20), rng, tally)
+    assert_held(tally.result(), 20)
+
+
+def test_the_device_says_where_a_number_is_none() -> None:
+    device = OnDevice()
+    for env, episode, kwargs in zip(itertools.cycle([1, 2, 0]), [0, 3] * 60, cases(), strict=False):
+        found = device.first_rollout(device.poison(env, episode, kwargs))
+        wanted = (True, _row(episode, kwargs), env, kwargs["field"] == "reward")
+        assert tuple(part.item() for part in found) == wanted, kwargs
+
+
+@pytest.mark.slow
+def test_the_device_learns_from_none_of_them(tmp_path: Path) -> None:
+    assert_held(experiment(20, 0, tmp_path), 40)
 
 
 def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
     """A run of several iterations: the last checkpoint is good, and it stops there again."""
     run = tmp_path / "run"
     kwargs = '{"field": "reward", "value": "nan", "episode": 25}'
-    with pytest.raises(SaunaError, match=r"environment 0 of seed 0, episode \d+.*reward is nan"):
+    wanted = r"environment 0 of seed 0, episode \d+.*reward is nan"
+    with trained_here(), pytest.raises(SaunaError, match=wanted):
         sauna.train("worlds:Poisoned", env_kwargs=kwargs, out=run, quiet=True, arm="ppo",
                     checkpoint_every=1, **{**SMALL, "steps": 3200})  # fmt: skip
     found = checkpoint.load_newest(run / "checkpoints", print)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import time
 from pathlib import Path
 
+import pytest
+
+from faults.canned import Ended, Trap, go, played_back, record, until
 from faults.chain import (
     PATIENCE,
     Chain,
@@ -17,8 +21,10 @@ from faults.chain import (
     send,
     wait_for_rows,
 )
+from faults.disk import Op
 from faults.result import Result, Tally, assert_held
 from sauna import checkpoint
+from sauna.errors import Interrupted
 
 
 def experiment(signals: int, seed: int, place: Path) -> Result:
@@ -86,6 +92,37 @@ def _count(chain: Chain, said: str, tally: Tally, what: str) -> None:
         tally.count("came before training began")
 
 
+@pytest.mark.parametrize("twice", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_at_a_file_operation_saves_and_a_second_one_stops_at_once(
+    number: int, twice: bool, tmp_path: Path
+) -> None:
+    """The product's own handlers; the training is played back."""
+    with played_back(record()):
+        until(tmp_path / "whole", Trap())
+        for at in (10, 26, 40):
+            ops: list[Op] = []
+
+            def strike(op: Op) -> None:
+                ops.append(op)  # noqa: B023
+                if len(ops) == at:  # noqa: B023
+                    os.kill(os.getpid(), number)
+                if twice and len(ops) == at + 1:  # noqa: B023
+                    os.kill(os.getpid(), number)
+
+            run = tmp_path / f"run{at}"
+            error = until(run, strike)
+            assert isinstance(error, Interrupted) and error.signal_number == number
+            assert ("stopped at once" in str(error)) == twice
+            found = checkpoint.load_newest(run / "checkpoints", print)
+            if not twice:
+                size = (run / "metrics.jsonl").stat().st_size
+                assert found is not None and found.manifest["logs"]["metrics.jsonl"] == size
+            go(run)
+            assert Ended(tmp_path / "whole").differs(run) is None
+
+
+@pytest.mark.slow
 def test_a_signal_saves_and_a_second_one_leaves_a_safe_state(stage: Stage, tmp_path: Path) -> None:
     tally = Tally()
     _stop_again_and_again(stage, 3, random.Random(2), tmp_path, tally)
