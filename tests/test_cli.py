@@ -71,6 +71,9 @@ BAD = [
     (["resume", "nothere", "--gamma", "1"], "unknown argument '--gamma'"),
     (["eval", "nothere"], "nothere is not a run directory"),
     (["eval", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
+    (["inspect", "nothere"], "nothere is not a run directory"),
+    (["inspect", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
+    (["inspect", "nothere", "--pictures"], "did you mean '--no-pictures'?"),
     (["list", "foo"], "invalid choice"),
     (["trian", WORLD], "invalid choice: 'trian'"),
 ]

@@ -139,6 +139,18 @@ class Scripted(World):
         return self.cut and self.t >= self.end
 
 
+class Drawn(Scripted):
+    """The same, and its picture is as bright as its step."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+
+    def render(self) -> np.ndarray | None:
+        return np.full((40, 60, 3), 20 * self.t, np.uint8) if self.render_mode else None
+
+
 class Unlucky(Scripted):
     """Raises in the fourth episode of the member with seed 1, and only there."""
 

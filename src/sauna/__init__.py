@@ -9,13 +9,14 @@ if TYPE_CHECKING:
     from sauna.envs.jax_env import JaxEnv, Transition
     from sauna.errors import BadInput, SaunaError
     from sauna.evaluation import evaluate
+    from sauna.inspection.command import inspect
     from sauna.selection.filters import Filter
     from sauna.selection.vex import VexTarget
 
 __version__ = "0.1.0"
 
 __all__ = ["BadInput", "Filter", "JaxEnv", "Result", "SaunaError", "Transition", "VexTarget",
-           "compare", "evaluate", "load", "resume", "train"]  # fmt: skip
+           "compare", "evaluate", "inspect", "load", "resume", "train"]  # fmt: skip
 
 _HOMES = {
     "BadInput": "sauna.errors",
@@ -28,6 +29,7 @@ _HOMES = {
     "JaxEnv": "sauna.envs.jax_env",
     "Transition": "sauna.envs.jax_env",
     "evaluate": "sauna.evaluation",
+    "inspect": "sauna.inspection.command",
     "Filter": "sauna.selection.filters",
     "VexTarget": "sauna.selection.vex",
 }

@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | compare | study | bench | list`.
+"""The command line: `sauna train | resume | eval | inspect | compare | study | bench | list`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -58,6 +58,19 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
     evaluate.add_argument("--video", action="store_true", help="film the first episode")
+
+    text = "one page: an episode, what the Vex head says of it, what the filter drops"
+    inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
+    inspect.add_argument("run", metavar="RUN", help="run directory")
+    inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
+    inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")
+    text = "the most likely action (default: sampled, as in training)"
+    inspect.add_argument("--deterministic", action="store_true", help=text)
+    inspect.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
+    text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
+    inspect.add_argument("--out", metavar="PAGE", help=text)
+    text = "leave the pictures out: needs no renderer"
+    inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, allow_abbrev=False)
@@ -225,6 +238,17 @@ def _eval(values: dict[str, Any]) -> None:
         print(f"video: {result['video']}")
 
 
+def _inspect(values: dict[str, Any]) -> None:
+    run = Path(values.pop("run"))
+    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("PJRT_NPROC", "1")
+    from sauna.inspection.command import inspect
+
+    path = inspect(run, **values, say=_say)
+    print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+
+
 def _whole(values: dict[str, Any], name: str, least: int) -> int:
     if not values[name].isdigit() or int(values[name]) < least:
         raise BadInput(f"{name}: must be a whole number of at least {least}")
@@ -359,5 +383,5 @@ TARGET_HELP = dict(
         strict=True,
     )
 )
-_COMMANDS = {"train": _train, "resume": _resume, "eval": _eval, "compare": _compare,
-             "study": _study, "bench": _bench, "list": _list}  # fmt: skip
+_COMMANDS = {"train": _train, "resume": _resume, "eval": _eval, "inspect": _inspect,
+             "compare": _compare, "study": _study, "bench": _bench, "list": _list}  # fmt: skip

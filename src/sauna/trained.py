@@ -16,6 +16,8 @@ from sauna.envs.gymnasium import make_env
 from sauna.member_state import fitting, flat_params, under
 from sauna.spaces import action_writer, observation_reader
 
+CHUNK = 512  # observations of one call of `predict`: one compiled shape, and bounded memory
+
 
 class TrainedPolicy:
     """`policy(observation) -> action` for one raw observation of the environment.
@@ -54,6 +56,7 @@ class TrainedPolicy:
             })  # fmt: skip
         self._dtype = artifact.spaces.observation_dtype
         self._act = jax.jit(self._choose, static_argnames="deterministic")
+        self._predict = jax.jit(self._heads)
 
     def _choose(self, observation: Any, key: Any, *, deterministic: bool) -> Any:
         distribution = self._policy.distribution
@@ -69,9 +72,28 @@ class TrainedPolicy:
         """
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
+        key = jax.random.key(0) if key is None else key
+        action = self._act(self.see(observation)[None], key, deterministic=deterministic)
+        return self._write(np.asarray(action)[0])
+
+    def see(self, observation: Any) -> np.ndarray:
+        """What the network gets of one raw observation `[*obs]`: float32, normalised; or uint8."""
         seen = self._read(observation)[None]
         if self.config.normalize_observations:
             seen = normalize(self._moments, seen, self.config.clip_observations)
-        key = jax.random.key(0) if key is None else key
-        action = self._act(seen.astype(self._dtype), key, deterministic=deterministic)
-        return self._write(np.asarray(action)[0])
+        return seen[0].astype(self._dtype)
+
+    def _heads(self, observation: Any) -> Any:
+        output = self._policy.apply(self._params, observation)
+        return output.value, output.vex
+
+    def predict(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """V and the Vex head, `[L]` each, at what the network got `[L, *obs]`."""
+        found = []
+        for first in range(0, len(seen), CHUNK):
+            part = seen[first : first + CHUNK]
+            padded = np.zeros((CHUNK, *part.shape[1:]), part.dtype)
+            padded[: len(part)] = part
+            found.append([np.asarray(head)[: len(part)] for head in self._predict(padded)])
+        value, vex = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return value, vex

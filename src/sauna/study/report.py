@@ -7,20 +7,16 @@ are pictures; `page/report.js` puts figures that answer to pointer and keyboard 
 from __future__ import annotations
 
 import base64
-import hashlib
-import json
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from sauna.study import tables
 from sauna.study.figures import NOTHING, Extra, Panel, Plot, looks_of, plots_of, write_figures
+from sauna.study.page import filled, rounded
 from sauna.style import Look, short
 
 # A shape beside the colour of each kind of verdict.
@@ -61,15 +57,12 @@ def make_page(
     extra: Extra = NOTHING,
 ) -> str:
     """The page as text; `pictures` are the SVG files that it shows where no script runs."""
-    script, css, page = (_asset(f"report.{kind}") for kind in ("js", "css", "html"))
     looks = {**looks_of(results), **extra.looks}
     plots = [*extra.plots, *plots_of(results, summary)]
-    return Template(page).substitute(
-        style=css + line_colours(looks),
-        script=script,
-        # The browser runs this one script and fetches nothing, whatever a label may hold.
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        data=embedded(page_data(looks, plots)),
+    return filled(
+        "report",
+        page_data(looks, plots),
+        line_colours(looks),
         title=escape(results["name"]),
         scope=scope(results),
         extra=f'<section id="measured"><h2>{extra.title}</h2>{extra.html}</section>'
@@ -88,10 +81,6 @@ def make_page(
         settings=tables.settings(results),
         command=escape(results["command"]),
     )
-
-
-def _asset(name: str) -> str:
-    return (files("sauna.study") / "page" / name).read_text(encoding="utf-8")
 
 
 def scope(results: Mapping[str, Any]) -> str:
@@ -153,11 +142,6 @@ def panel_text(plot: Plot, panel: Panel) -> str:
     return f"{plot.title} of {panel.task}, {plot.y_label} by {plot.x_label}: {said}."
 
 
-def embedded(value: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-
-
 def line_colours(looks: Mapping[str, Look]) -> str:
     """The labels' colours as variables, for light and for dark pages."""
     light = "".join(f"--line{i}:{look.colour};" for i, look in enumerate(looks.values()))
@@ -176,14 +160,3 @@ def page_data(looks: Mapping[str, Look], plots: Sequence[Plot]) -> dict[str, Any
         for panel, shown in zip(plot.panels, values["panels"], strict=True):
             shown["text"] = panel_text(plot, panel)
     return {"labels": labels, "plots": rounded(drawn)}
-
-
-def rounded(value: Any) -> Any:
-    """A JSON value with its numbers to five digits, and null for those that are not finite."""
-    if isinstance(value, dict):
-        return {key: rounded(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [rounded(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.5g}") if math.isfinite(value) else None
-    return value
