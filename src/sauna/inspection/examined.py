@@ -107,7 +107,9 @@ def examine(
     )
 
 
-def _hypers(run: Path, config: Config, index: int, iteration: int, own: Mapping[str, np.ndarray]) -> Hypers:
+def _hypers(
+    run: Path, config: Config, index: int, iteration: int, own: Mapping[str, np.ndarray]
+) -> Hypers:
     """The member's traced settings, at the checkpoint's iteration; `own` are its arrays."""
     rates = rundir.read_config(run).get("drop_rates") or []
     counters = Counters.from_arrays(own)
