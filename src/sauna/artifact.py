@@ -14,7 +14,7 @@ from sauna.spaces import Spaces, describe, read_spaces
 
 
 class Artifact(NamedTuple):
-    """The newest good checkpoint of a run and what it is of."""
+    """A checkpoint of a run and what it is of."""
 
     config: Config
     spaces: Spaces
@@ -22,15 +22,20 @@ class Artifact(NamedTuple):
     checkpoint: checkpoint.Checkpoint
 
 
-def load_artifact(run: Path, warn: Callable[[str], None] = print) -> Artifact:
-    """Reads a run's newest good checkpoint.
+def load_artifact(
+    run: Path, warn: Callable[[str], None] = print, iteration: int | None = None
+) -> Artifact:
+    """Reads a run's newest good checkpoint, or the one of an iteration.
 
     Raises:
       BadInput: no run there, or no checkpoint yet.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
     rundir.read_config(run)
-    loaded = checkpoint.load_newest(run / "checkpoints", warn)
+    if iteration is None:
+        loaded = checkpoint.load_newest(run / "checkpoints", warn)
+    else:
+        loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     if loaded is None:
         raise BadInput(f"{run} has no checkpoint yet")
     try:

@@ -26,7 +26,8 @@ from sauna.worker import configure_jax
 def measure(given: dict[str, Any]) -> None:
     """Makes every measurement whose file is not there yet."""
     configure_jax()
-    from sauna.measure import coverage, noise
+    from sauna.artifact import load_artifact
+    from sauna.measure import coverage, noise, torso
     from sauna.measure.streams import load_standing
 
     scale: Any = given.get("scale")
@@ -35,7 +36,10 @@ def measure(given: dict[str, Any]) -> None:
         if Path(file).exists():
             continue
         standing = load_standing(Path(given["run"]), given["member"], iteration)
-        if given["what"] == "noise":
+        if given["what"] == "torso":
+            artifact = load_artifact(Path(given["run"]), iteration=iteration)
+            found = torso.measure(artifact, given["member"], Path(file).with_suffix(".png"))
+        elif given["what"] == "noise":
             found = noise.measure(standing)
         else:
             found = coverage.measure(standing, scale)

@@ -185,19 +185,21 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
 
 def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
     """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
-    from sauna.study import dial, noise
+    from sauna.study import dial, noise, torso
     from sauna.study.figures import NOTHING
     from sauna.study.report import write_report
 
     results = gather(spec, units, folder, command)
     summary = summarize(results)
-    rundir.write_json(place / "results.json", results)
-    rundir.write_json(place / "summary.json", summary)
     extra = NOTHING
     if spec.measure:
         measured = gather_measured(spec, units, folder, place, results)
         rundir.write_json(place / f"{spec.measure}.json", measured)
-        extra = {"noise": noise.extra, "dial": dial.extra}[spec.measure](measured)
+        study = {"noise": noise, "dial": dial, "torso": torso}[spec.measure]
+        summary["measured"] = study.verdicts(measured)
+        extra = torso.extra(measured, place) if study is torso else study.extra(measured)
+    rundir.write_json(place / "results.json", results)
+    rundir.write_json(place / "summary.json", summary)
     write_report(results, summary, place, extra)
     return summary
 
@@ -228,7 +230,8 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     rows = [head, *(_row(row) for row in summary["table"])]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
-    return [*(line.rstrip() for line in table), "", *(v["text"] for v in summary["verdicts"])]
+    said = [*(v["text"] for v in summary["verdicts"]), *summary.get("measured", [])]
+    return [*(line.rstrip() for line in table), "", *said]
 
 
 def _row(row: Mapping[str, Any]) -> list[str]:

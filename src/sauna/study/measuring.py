@@ -21,7 +21,9 @@ from sauna.study.spec import Spec, check, drops_nothing
 from sauna.study.statistics import area_under_curve
 from sauna.study.units import Unit, parts
 
-POINTS = (0.05, 0.25, 0.5, 0.75, 1.0)  # shares of the budget that are nearest to a checkpoint
+# Shares of the budget at which each measurement is made, at the checkpoint nearest to it.
+ALONG = (0.05, 0.25, 0.5, 0.75, 1.0)
+POINTS = {"noise": ALONG, "dial": ALONG, "torso": (1.0,)}
 SETTINGS = ("threshold", "threshold_schedule", "keep_rate_target")  # that a cell is known by
 
 
@@ -33,7 +35,7 @@ class Item(NamedTuple):
     arm: str
     seed: int
     run: Path
-    points: list[float]  # of `POINTS`, those that have a checkpoint of their own
+    points: list[float]  # of the measurement's `POINTS`, those that have a checkpoint of their own
     iterations: list[int]
     files: list[Path]
 
@@ -54,14 +56,15 @@ def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterat
                 if not part.is_complete(folder):
                     continue
                 for seed in part.seeds:
-                    chosen = checkpoints_at(part.run(folder), seed, config.steps)
+                    points = POINTS[spec.measure]
+                    chosen = checkpoints_at(part.run(folder), seed, config.steps, points)
                     name = f"{part.name.replace('/', '_')}_{seed}"
                     files = [place / spec.measure / f"{name}_{i:08d}.json" for i in chosen.values()]
                     yield Item(unit.task, arm.label, arm.arm, seed, part.run(folder),
                                [*chosen], [*chosen.values()], files)  # fmt: skip
 
 
-def checkpoints_at(run: Path, seed: int, steps: int) -> dict[float, int]:
+def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) -> dict[float, int]:
     """`{point: iteration}`: the checkpoint of a seed nearest to each point, none of them twice."""
     rows = [row for row in rundir.rows(run) if row["seed"] == seed]
     reached = {
@@ -71,7 +74,7 @@ def checkpoints_at(run: Path, seed: int, steps: int) -> dict[float, int]:
         for path in numbered(run / "checkpoints")
     }
     chosen: dict[float, int] = {}
-    for point in POINTS:
+    for point in points:
         best = min(reached, key=lambda i: (abs(reached[i] - point * steps), i), default=None)
         if best is not None and best not in chosen.values():
             chosen[point] = best
@@ -196,6 +199,7 @@ def gather_measured(
             settings = {name: config[name] for name in SETTINGS}
             cells.append(
                 {"task": key[0], "label": key[1], "arm": cell["arm"], "steps": config["steps"],
+                 "baseline": arms[key[1]].baseline, "seeds": len(arms[key[1]].seeds),
                  "rates_of": arms[key[1]].rates_of, "config": settings, "members": members}
             )  # fmt: skip
     return {

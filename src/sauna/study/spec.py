@@ -14,9 +14,10 @@
     threshold = 0.8
 
 Any setting of a run may stand at the top, for all arms, or in an arm. `baseline` is the label that
-others are compared with. `measure` names what is measured of the trained members at checkpoints
-along their training (`noise`, `dial`). An arm may name its own `tasks`, `seeds` and `baseline`; a
-`random-drop` arm repeats the measured drop rates of the arm `rates_of`.
+others are compared with. `measure` names what is measured of the trained members: `noise` or
+`dial` at checkpoints along their training, `torso` (of HalfCheetah) at its end. An arm may name its
+own `tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured drop rates of the arm
+`rates_of`.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from sauna.presets import ARMS, FIXED, arm_config, parse_all, resolve
 _OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard", "distributed")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
-MEASURES = ("noise", "dial")
+MEASURES = ("noise", "dial", "torso")
 _ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
 
 
@@ -158,11 +159,13 @@ def _check_measure(measure: Any, configs: list[Config]) -> None:
     for config in configs:
         rollout = config.rollout_steps * config.envs
         kept = config.keep_checkpoints * config.checkpoint_every * rollout
-        if kept < config.steps:
+        if measure != "torso" and kept < config.steps:
             raise BadInput("keep_checkpoints: measure needs the checkpoints along training; set "
                            "checkpoint_every = 10 and keep_checkpoints = 1000")  # fmt: skip
         if config.backend == "device":
             raise BadInput("backend: measure needs environments on the host")
+        if measure == "torso" and not config.env.startswith("HalfCheetah"):
+            raise BadInput(f'study: measure = "torso" is of HalfCheetah, not of {config.env}')
         if measure == "dial" and not config.normalize_observations:
             raise BadInput("normalize_observations: dial takes its scale from the normaliser")
     if measure == "noise" and all(map(drops_nothing, configs)):
