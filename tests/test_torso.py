@@ -67,7 +67,7 @@ def cell(label: str, upright: list[float], baseline: str | None, seeds: int = 30
         {"seed": seed, "points": [{
             "upright": share, "stills": [*STILLS], "picture": f"{label}-{seed}.png",
             "episodes": [{"return": 1000.0 + 2000.0 * (share > 0.5), "upright": share}] * 2,
-        }]}
+        }], "curve": {"env_steps": [10, 20], "explained_variance": [None, 0.1 * seed]}}
         for seed, share in enumerate(upright)
     ]  # fmt: skip
     return {"task": "HalfCheetah-v5", "label": label, "arm": label, "baseline": baseline,
@@ -132,6 +132,9 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
     upper, lower = np.array_split(drawn, 2)
     assert (upper == (0, 50, 0)).all(-1).any() and (lower == (200, 50, 0)).all(-1).any()
     assert not (upper == (200, 50, 0)).all(-1).any()
+    [plot] = extra.plots
+    assert [(line.label, line.y) for line in plot.panels[0].lines] == [
+        ("ppo", [None, 0.1 * 3]), ("sauna", [None, 0.1 * 3])]  # fmt: skip
     assert "ppo seed 3, on its back (return 1,000), sauna seed 3, on its feet" in extra.html
     assert 'src="data:image/png;base64,' in extra.html
     for one in found["cells"]:

@@ -14,9 +14,10 @@ from sauna.selection.filters import EPSILON
 from sauna.study.page import asset, filled, rounded
 from sauna.study.tables import DOT, table
 
-SETTINGS = ("filter", "threshold", "drop_rate", "history", "decision", "dropped", "vex_target",
-            "vex_coef", "rollout_steps", "envs", "gae_over", "truncation", "gamma", "gae_lambda",
-            "normalize_observations", "normalize_rewards")  # fmt: skip
+SETTINGS = ("filter", "threshold", "threshold_schedule", "keep_rate_target", "drop_rate",
+            "history", "decision", "dropped", "vex_target", "vex_coef", "rollout_steps", "envs",
+            "gae_over", "truncation", "gamma", "gae_lambda", "normalize_observations",
+            "normalize_rewards")  # fmt: skip
 
 
 def make_page(found: Inspection, run: Path) -> str:
@@ -128,6 +129,9 @@ def notes(found: Inspection) -> list[str]:
             f"Keep rate here {kept:.3f}; in the last iteration of training "
             f"{found.trained_keep_rate:.3f}."
         )
+    if config.keep_rate_target and config.filter == "sauna":
+        said.append(f"The threshold moves at every step so that {config.keep_rate_target:g} of "
+                    f"the steps are kept: there is no one band to draw.")  # fmt: skip
     if config.filter == "random-drop":
         said.append(f"random-drop: each step is dropped with a chance of "
                     f"{found.hypers.drop_rate:.3f}, whatever the head says.")  # fmt: skip

@@ -191,6 +191,7 @@ def gather_measured(
                 "entropy": mean_over_training(member["curve"], "entropy"),
                 "threshold": usual(member["curve"], "threshold"),
                 "points": points[*key, member["seed"]],
+                **({"curve": explained(member["curve"])} if spec.measure == "torso" else {}),
             }
             for member in cell["members"]
             if (*key, member["seed"]) in points
@@ -206,6 +207,11 @@ def gather_measured(
         "name": spec.name, "command": results["command"], "measure": spec.measure, "cells": cells,
         **{name: results[name] for name in ("versions", "machine", "git")},
     }  # fmt: skip
+
+
+def explained(curve: Mapping[str, Any]) -> dict[str, Any]:
+    """The explained variance over training, of a curve of `results`."""
+    return {name: curve[name] for name in ("env_steps", "explained_variance")}
 
 
 def mean_over_training(curve: Mapping[str, Any], name: str) -> float | None:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from sauna import style
-from sauna.study.figures import Extra
+from sauna.study.figures import Extra, Line, Panel, Plot
 from sauna.study.statistics import ALPHA, Estimate
 from sauna.study.tables import digits_of, number, table
 
@@ -38,6 +38,7 @@ class Posture(NamedTuple):
     return_: float  # mean over the episodes
     stills: list[int]  # env steps that a picture shows
     picture: str  # its file's name
+    curve: Mapping[str, Any]  # the explained variance over training
 
     @property
     def on_feet(self) -> bool:
@@ -64,6 +65,7 @@ def postures(cell: Mapping[str, Any]) -> list[Posture]:
             float(np.mean([episode["return"] for episode in point["episodes"]])),
             point["stills"],
             point.get("picture", ""),
+            member["curve"],
         )
         for member in cell["members"]
         for point in member["points"]
@@ -134,9 +136,8 @@ def extra(measured: Mapping[str, Any], place: Path) -> Extra:
     head = ("Arm", "Seeds", "On its feet", "Between", "Return on its feet", "Return on its back")
     rows = [(escape(cell["label"]), _row(cell)) for cell in measured["cells"]]
     html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    return Extra(
-        TITLE, html + table(head, rows, name="Postures") + _figure(measured, place), (), {}
-    )
+    html += table(head, rows, name="Postures") if rows else ""
+    return Extra(TITLE, html + _figure(measured, place), plots(measured), {})
 
 
 def _row(cell: Mapping[str, Any]) -> list[str]:
@@ -154,15 +155,14 @@ def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
     """The two members whose stills are shown, the baseline's first.
 
     The first seed on its feet in the arm and on its back in the baseline; failing that, the first
-    that is measured in both. Empty where nothing was drawn.
+    that is measured in both.
     """
     for cell in measured["cells"]:
         for other in measured["cells"]:
             if (other["label"], other["task"]) != (cell["baseline"], cell["task"]):
                 continue
-            base = {one.seed: one for one in postures(other) if one.stills}
-            both = [(base[own.seed], own) for own in postures(cell)
-                    if own.stills and own.seed in base]  # fmt: skip
+            base = {one.seed: one for one in postures(other)}
+            both = [(base[own.seed], own) for own in postures(cell) if own.seed in base]
             both.sort(key=lambda two: two[0].on_feet or not two[1].on_feet)
             if both:
                 return [(other["label"], both[0][0]), (cell["label"], both[0][1])]
@@ -172,7 +172,7 @@ def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
 def _figure(measured: Mapping[str, Any], place: Path) -> str:
     """The strip of stills as HTML, or why there is none."""
     pair = shown_pair(measured)
-    if not pair:
+    if not pair or not all(one.stills for _, one in pair):
         reasons = [point["not_drawn"] for cell in measured["cells"] for member in cell["members"]
                    for point in member["points"] if "not_drawn" in point]  # fmt: skip
         return f"<p>No stills: {escape(reasons[0])}.</p>" if reasons else ""
@@ -186,6 +186,24 @@ def _figure(measured: Mapping[str, Any], place: Path) -> str:
         f'{text}" style="display:block;width:100%;min-width:48rem;background:#fff" '
         f'src="data:image/png;base64,{data}"></div></figure>'
     )
+
+
+def plots(measured: Mapping[str, Any]) -> list[Plot]:
+    """The explained variance of both members of the pair over training."""
+    pair = shown_pair(measured)
+    if not pair:
+        return []
+    lines = []
+    for label, one in pair:
+        x, y = one.curve["env_steps"], one.curve["explained_variance"]
+        lines.append(Line(label, x, y, [None] * len(x), [None] * len(x), []))
+    said = ", ".join(f"{label} {_posture(one)}" for label, one in pair)
+    caption = f"Of one pair of seeds: {said}. The axis is cut at -1."
+    panel = Panel(f"{measured['cells'][0]['task']}, seed {pair[0][1].seed}", lines)
+    return [
+        Plot("pair", "Explained variance of one pair", caption, "env steps", "explained variance",
+             (-1.0, 1.0), [panel])
+    ]  # fmt: skip
 
 
 def _posture(one: Posture) -> str:
