@@ -7,7 +7,14 @@ import pytest
 
 from helpers import make_job, train_here
 from sauna.collect.moments import ObservationMoments
-from sauna.core.normalize import initial_moments, normalize, update_moments
+from sauna.core.normalize import (
+    Moments,
+    initial_moments,
+    moments_after_each,
+    normalize,
+    scale_rewards,
+    update_moments,
+)
 from test_reference import RunningNormalizer
 
 
@@ -86,3 +93,18 @@ def test_normalized_values_are_clipped() -> None:
     moments = initial_moments((), 2)
     got = normalize(moments, np.array([[100.0, -0.5]]), 10.0)
     np.testing.assert_allclose(got, [[10.0, -0.5]])
+    after = Moments(np.zeros(2), np.array([4.0, 1.0]), np.ones(2))
+    got = scale_rewards(after, np.array([[6.0, -1.0], [100.0, -100.0]]), 10.0)
+    np.testing.assert_allclose(got, [[3.0, -0.5], [10.0, -10.0]])
+
+
+def test_moments_of_all_rows_at_once_are_those_of_row_after_row() -> None:
+    rng = np.random.default_rng(2)
+    values, valid = rng.normal(5, 2, (20, 3)), rng.random((20, 3)) < 0.7
+    start = Moments(np.array(1.0), np.array(2.0), np.array(3.0))
+    got = moments_after_each(start, values, valid)
+    expected = Moments(*(part[None] for part in start))
+    for row in range(20):
+        expected = update_moments(expected, values[row][:, None], valid[row])
+        for after, wanted in zip(got, expected, strict=True):
+            np.testing.assert_allclose(after[row], wanted[0], rtol=1e-12)
