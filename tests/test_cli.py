@@ -225,7 +225,32 @@ def test_presets_are_the_published_numbers() -> None:
     assert changed == {"preset", "envs", "rollout_steps", "minibatches", "epochs"}
     assert (flagrun.rollout_steps, flagrun.envs, flagrun.epochs) == (512, 32, 15)
     assert flagrun.rollout_steps * flagrun.envs // flagrun.minibatches == 4096
-    assert set(PRESETS) == {"mujoco", "mujoco-release", "flagrun", "a2c", "a2c-mujoco"}
+    atari = resolve({"env": "x", "arm": "ppo", "preset": "atari"})
+    published = {
+        "rollout_steps": 128, "envs": 8, "minibatches": 4, "epochs": 3, "learning_rate": 2.5e-4,
+        "learning_rate_schedule": "linear", "clip_range": 0.1, "entropy_coef": 0.01,
+        "value_coef": 1.0, "gamma": 0.99, "gae_lambda": 0.95, "trunk": "shared",
+        "sign_rewards": True, "normalize_rewards": False, "clip_value": True,
+    }  # fmt: skip
+    assert {name: getattr(atari, name) for name in published} == published
+    minatar = resolve({"env": "x", "arm": "ppo", "preset": "minatar"})
+    published = {
+        "rollout_steps": 128, "envs": 64, "minibatches": 8, "epochs": 4, "learning_rate": 5e-3,
+        "learning_rate_schedule": "linear", "clip_range": 0.2, "entropy_coef": 0.01,
+        "value_coef": 0.5, "gamma": 0.99, "gae_lambda": 0.95, "hidden": (64, 64),
+        "activation": "relu", "trunk": "separate", "normalize_observations": False,
+        "normalize_rewards": False, "sign_rewards": False,
+    }  # fmt: skip
+    assert {name: getattr(minatar, name) for name in published} == published
+    assert set(PRESETS) == {
+        "mujoco",
+        "mujoco-release",
+        "flagrun",
+        "atari",
+        "minatar",
+        "a2c",
+        "a2c-mujoco",
+    }
 
 
 def test_arms_are_the_options_table() -> None:

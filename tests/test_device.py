@@ -46,6 +46,7 @@ class SteppedHere(HostEnvs):
             np.asarray(self._running.observation, np.float64),
             np.asarray(told.reward, np.float64),
             *ends,
+            np.zeros_like(ends[0]),
             np.asarray(told.observation, np.float64),
             bool((ends[0] | ends[1]).any()),
         )
@@ -55,7 +56,7 @@ slow = pytest.mark.slow
 ARMS = [
     pytest.param("ppo", {}, marks=slow),
     ("sauna", {"threshold": 0.9}),
-    ("sauna", {"threshold": 0.9, "dropped": "mask"}),
+    ("sauna", {"threshold": 0.9, "dropped": "mask", "sign_rewards": True}),
     pytest.param("sauna", {"keep_rate_target": 0.6}, marks=slow),
     pytest.param("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}, marks=slow),
     pytest.param(

@@ -15,6 +15,7 @@ from scipy import stats
 from helpers import configured, make_job, train_here
 from sauna.collect.actor import make_actor
 from sauna.core.distributions import bernoulli, gaussian, multi_categorical
+from sauna.core.networks import Convolution, NatureCNN
 from sauna.core.policy import make_policy
 from sauna.errors import BadInput
 from sauna.member_state import flat_params, named_params
@@ -125,6 +126,47 @@ def test_nature_cnn_takes_bytes() -> None:
     assert [params[f"conv_{i}"]["kernel"].shape for i in range(3)] == [
         (8, 8, 2, 32), (4, 4, 32, 64), (3, 3, 64, 64),
     ]  # fmt: skip
+
+
+def test_the_nature_cnn_by_hand() -> None:
+    """84 -> 20 -> 9 -> 7 pixels, 7 x 7 x 64 = 3136 features; each layer's weights and biases."""
+    picture = jax.ShapeDtypeStruct((2, 84, 84, 4), jnp.uint8)
+    features, params = jax.eval_shape(
+        lambda x: NatureCNN().init_with_output(jax.random.key(0), x), picture
+    )
+    assert features.shape == (2, 512)
+    sizes = {name: sum(math.prod(p.shape) for p in jax.tree.leaves(layer))
+             for name, layer in params["params"].items()}  # fmt: skip
+    assert sizes == {
+        "conv_0": 8 * 8 * 4 * 32 + 32, "conv_1": 4 * 4 * 32 * 64 + 64,
+        "conv_2": 3 * 3 * 64 * 64 + 64, "dense": 3136 * 512 + 512,
+    }  # fmt: skip
+    assert sum(sizes.values()) == 1_684_128
+
+
+@pytest.mark.parametrize("kernel, stride, height, width", [(8, 4, 21, 24), (3, 1, 5, 7)])
+def test_a_convolution_is_one(kernel: int, stride: int, height: int, width: int) -> None:
+    """Against XLA's, with its gradients, where pixels at the edges are left over, too."""
+    layer = Convolution(5, kernel, stride)
+    x = np.random.default_rng(0).normal(size=(2, height, width, 3)).astype(np.float32)
+    params = jax.jit(layer.init)(jax.random.key(0), x)
+
+    def theirs(params, x):
+        own = params["params"]
+        y = jax.lax.conv_general_dilated(x, own["kernel"], (stride,) * 2, "VALID",
+                                         dimension_numbers=("NHWC", "HWIO", "NHWC"))  # fmt: skip
+        return y + own["bias"]
+
+    def of(function):
+        def squares(params, x):
+            y = function(params, x)
+            return (y**2).sum(), y
+
+        return jax.jit(jax.grad(squares, (0, 1), has_aux=True))(params, x)
+
+    ours, expected = jax.tree.leaves(of(layer.apply)), jax.tree.leaves(of(theirs))
+    for one, other in zip(ours, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-3)
 
 
 def test_named_parameters_go_round() -> None:

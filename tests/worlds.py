@@ -365,3 +365,16 @@ class Spaced(World):
     def reward(self, action: Any) -> float:
         assert self.action_space.contains(action), action
         return 1.0
+
+
+class Lives(World):
+    """Three lives of two steps each, one game; rewards 5 and -3 in turn."""
+
+    length = 6
+
+    def reward(self, action: Any) -> float:
+        return 5.0 if self.t % 2 == 0 else -3.0
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        told = super().step(action)
+        return *told[:4], {"life_lost": self.t in (2, 4)}

@@ -18,7 +18,7 @@ from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.errors import BadInput, Interrupted, SaunaError, nearest
 from sauna.presets import ARM_HELP, COMPARED, PRESET_HELP, given_by, parse_all
 
-LISTS = ("envs", *NATIVE, "arms", "presets", "filters", "targets", "studies")
+LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 # Fields that a comparison decides itself.
 _STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
@@ -342,6 +342,11 @@ def _list(values: dict[str, Any]) -> None:
             print(name)
         for backend in NATIVE:
             print(f"{backend}/...  (on the device; `sauna list {backend}` names them)")
+        print("ALE/...  (`sauna list atari` names them)")
+    elif what == "atari":
+        from sauna.envs.atari import names
+
+        print("\n".join(names()))
     elif what in NATIVE:
         from sauna.envs.jax_native import names_of
 

@@ -166,6 +166,9 @@ class Config:
     normalize_observations: bool = option(
         True, "running mean and variance of vector observations (images are divided by 255)"
     )
+    sign_rewards: bool = option(
+        False, "learn from each reward's sign, -1, 0 or 1 (returns are told in full)"
+    )
     normalize_rewards: bool = option(True, "divide rewards by the std of the discounted return")
     clip_observations: float = option(10.0, "bound of normalised observations", above=0)
     clip_rewards: float = option(10.0, "bound of normalised rewards", above=0)

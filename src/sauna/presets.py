@@ -22,6 +22,33 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Their log-std was annealed and their step size followed the KL divergence; here the log-std
     # is learned and the step size falls linearly, as everywhere else.
     "flagrun": {"envs": 32, "rollout_steps": 512, "minibatches": 4, "epochs": 15},
+    # Schulman et al. (2017) on Atari, as in OpenAI baselines (whose clip range also falls to 0).
+    "atari": {
+        "envs": 8,
+        "rollout_steps": 128,
+        "minibatches": 4,
+        "epochs": 3,
+        "learning_rate": 2.5e-4,
+        "clip_range": 0.1,
+        "entropy_coef": 0.01,
+        "value_coef": 1.0,
+        "trunk": "shared",
+        "sign_rewards": True,
+        "normalize_rewards": False,
+    },
+    # PureJaxRL's settings for gymnax's MinAtar (examples/brax_minatar.ipynb): two 64-64 MLPs on
+    # the flattened picture. Theirs are for 10^7 steps, over which the step size falls to 0.
+    "minatar": {
+        "envs": 64,
+        "rollout_steps": 128,
+        "minibatches": 8,
+        "epochs": 4,
+        "learning_rate": 5e-3,
+        "entropy_coef": 0.01,
+        "activation": "relu",
+        "normalize_observations": False,
+        "normalize_rewards": False,
+    },
     # Mnih et al. (2016) in its synchronous form, with OpenAI baselines' defaults (`a2c.py`).
     # Lambda 1 makes n-step returns. A checkpoint comes after as many env steps as with PPO.
     "a2c": {
@@ -48,6 +75,8 @@ PRESET_HELP = {
     "mujoco": "PPO on MuJoCo as published (Schulman et al. 2017, OpenAI baselines)",
     "mujoco-release": "the same as the SAUNA authors ran it: 15 epochs, constant learning rate",
     "flagrun": "PPO on HumanoidFlagrunHarder: 32 actors, 512 steps each, minibatches of 4096",
+    "atari": "PPO on Atari as published: Nature CNN, 8 games, signs of rewards",
+    "minatar": "PPO on gymnax's MinAtar as PureJaxRL runs it: 64 environments, 64-64 MLPs",
     "a2c": "A2C as published (Mnih et al. 2016, OpenAI baselines): 16 actors, 5 steps each",
     "a2c-mujoco": "the same for continuous control: separate trunks, no entropy bonus",
 }

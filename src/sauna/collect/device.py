@@ -311,6 +311,8 @@ def _scaled_rewards(
     config: Config, state: CollectState, rows: _Row, hypers: Hypers
 ) -> tuple[Array, CollectState]:
     """Rewards over the running std of the discounted return, as in VecNormalize."""
+    if config.sign_rewards:
+        rows = rows._replace(reward=jnp.sign(rows.reward))
     if not config.normalize_rewards:
         return rows.reward, state
 

@@ -71,6 +71,7 @@ class HostCollector:
         )
         self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
+        self._over = np.zeros(self._rewards.shape, bool)  # episodes; a lost life is not one's end
         self._chunks = chunk_sizes(self._config.rollout_steps)
         self._uncompiled = program.filter is not None  # without one, every stretch is a rollout
         if program.filter is not None:
@@ -130,6 +131,7 @@ class HostCollector:
         buffers, members = self._buffers, range(len(self._keys))
         for name in ("valid", "keep", "terminated", "truncated"):
             getattr(buffers, name)[:] = False
+        self._over[:] = False
         if self._uncompiled:
             self._compile_stretches(params[0], hypers[0])
         self._actor.load(params)
@@ -233,6 +235,8 @@ class HostCollector:
         """Writes which episodes ended; the value of what a truncated one had reached is kept."""
         terminated = step.terminated.reshape(self._shape) & acting
         truncated = step.truncated.reshape(self._shape) & acting
+        self._over[:, row] = terminated | truncated
+        terminated |= step.life_lost.reshape(self._shape) & acting
         self._buffers.terminated[:, row] = terminated
         self._buffers.truncated[:, row] = truncated
         if self._config.truncation == "bootstrap" and truncated.any():
@@ -332,10 +336,11 @@ class HostCollector:
         valid = buffers.valid[member, :used]
         reward = np.where(valid, self._rewards[member, :used], 0.0)
         ended = (buffers.terminated | buffers.truncated)[member, :used]
-        buffers.reward[member, :used] = self._scaled(member, reward, ended, valid)
+        learned = np.sign(reward) if self._config.sign_rewards else reward
+        buffers.reward[member, :used] = self._scaled(member, learned, ended, valid)
         returns, lengths = state.episode_return[member], state.episode_length[member]
         starts, episodes = [0] * len(returns), []
-        for row, env in np.argwhere(ended).tolist():
+        for row, env in np.argwhere(self._over[member, :used]).tolist():
             episodes.append(
                 Episode(
                     env,

@@ -19,6 +19,10 @@ def in_process_envs(
       backend: `auto`, or `gymnasium` to have every step taken by Gymnasium itself.
     """
     make = env_maker(env, env_kwargs)
+    if backend == "auto" and env.startswith("ALE/"):
+        from sauna.envs.atari import AtariEnvs
+
+        return AtariEnvs(make, seeds)
     if backend == "auto" and is_mujoco(env):
         from sauna.envs.mujoco import MujocoEnvs, time_limit
 

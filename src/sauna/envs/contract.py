@@ -23,8 +23,9 @@ class Step(NamedTuple):
     reward: np.ndarray  # [M] float64
     terminated: np.ndarray  # [M] bool
     truncated: np.ndarray  # [M] bool, never together with terminated
+    life_lost: np.ndarray  # [M] bool, an end for learning alone: the episode goes on
     final_observation: np.ndarray  # [M, *obs], meaningful where an episode ended
-    ended: bool  # whether any episode ended: what most steps have to look at
+    ended: bool  # whether any episode ended or life was lost: what most steps have to look at
 
 
 class HostEnvs(Protocol):

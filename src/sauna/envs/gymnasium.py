@@ -43,6 +43,11 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
         from sauna.envs.jax_native import make_jax_env
 
         return lambda **more: HostFace(make_jax_env(env, env_kwargs), **more)
+    if env.startswith("ALE/"):
+        from sauna.envs.atari import AtariEnv, game_of
+
+        game = game_of(env)
+        return lambda **more: AtariEnv(game, **env_kwargs, **more)
     if ":" in env and not _GYMNASIUM_ID.match(env):
         function = import_name("env", env)
         return lambda **more: function(**env_kwargs, **more)
@@ -128,6 +133,7 @@ class GymnasiumEnvs(HostEnvs):
         self._reward = np.zeros(number)
         self._terminated = np.zeros(number, bool)
         self._truncated = np.zeros(number, bool)
+        self._life_lost = np.zeros(number, bool)
 
     def reset(self) -> np.ndarray:
         for index, slot in enumerate(self._slots):
@@ -148,6 +154,7 @@ class GymnasiumEnvs(HostEnvs):
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
         self._terminated[:] = False
         self._truncated[:] = False
+        self._life_lost[:] = False
         ended = False
         for index in np.flatnonzero(active):
             ended |= self._step_one(int(index), self._slots[index], action[index])
@@ -156,14 +163,19 @@ class GymnasiumEnvs(HostEnvs):
 
     def _told(self, ended: bool) -> Step:
         return Step(
-            self._observation, self._reward, self._terminated, self._truncated, self._final, ended
-        )
+            self._observation, self._reward, self._terminated, self._truncated, self._life_lost,
+            self._final, ended,
+        )  # fmt: skip
+
+    def _take(self, slot: Slot, action: np.ndarray) -> Any:
+        """One step of one environment, as Gymnasium gives it."""
+        return slot.env.step(self._write(action))
 
     def _step_one(self, index: int, slot: Slot, action: np.ndarray) -> bool:
-        """Steps one environment; whether its episode ended."""
+        """Steps one environment; whether its episode ended, or a life of it was lost."""
         slot.actions.append(action)
         try:
-            observation, reward, terminated, truncated, _ = slot.env.step(self._write(action))
+            observation, reward, terminated, truncated, info = self._take(slot, action)
         except Exception as error:
             raise EnvironmentFailure(f"{slot.name}: step raised {one_line(error)}") from error
         self._reward[index] = reward
@@ -176,7 +188,8 @@ class GymnasiumEnvs(HostEnvs):
             self._start_episode(index, slot)
             return True
         self._observation[index] = self._read(observation)
-        return False
+        self._life_lost[index] = lost = bool(info.get("life_lost", False))
+        return lost
 
     def _check_finite(self, active: np.ndarray) -> None:
         """One sum tells whether anything is amiss; only then the culprit is looked for."""
@@ -198,6 +211,8 @@ class GymnasiumEnvs(HostEnvs):
         return len(self._slots[index].actions)
 
     def _is_finite(self) -> bool:
+        if self.spaces.observation_kind == "image":  # bytes are finite, and many
+            return math.isfinite(self._reward.sum())
         return math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum)
 
     def snapshot(self, index: int) -> Snapshot:

@@ -68,7 +68,8 @@ class ProcessEnvs(HostEnvs):
             self._say(number, {"kind": "step"}, arrays)
         answers = [self._answer(number).arrays for number in range(len(self._workers))]
         parts = {name: np.concatenate([a[name] for a in answers]) for name in ARRAYS}
-        return Step(**parts, ended=bool(parts["terminated"].any() or parts["truncated"].any()))
+        ends = ("terminated", "truncated", "life_lost")
+        return Step(**parts, ended=any(bool(parts[name].any()) for name in ends))
 
     def snapshot(self, index: int) -> Snapshot:
         number, local = self._find(index)
