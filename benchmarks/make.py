@@ -25,6 +25,17 @@ MEASURED = {
     "cheetah_6_in_1": ["HalfCheetah-v5", "--processes", "1", "--rounds", "5"],
     "hopper_6": ["Hopper-v5", "--rounds", "5", "--iterations", "25"],
     "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "5"],
+    "pong_1": [
+        "ALE/Pong-v5",
+        "--preset",
+        "atari",
+        "--seeds",
+        "1",
+        "--against",
+        "sb3",
+        "--iterations",
+        "10",
+    ],
 }
 # Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
@@ -82,7 +93,7 @@ def stored() -> dict[str, dict[str, Any]]:
 
 def rates_table(found: dict[str, dict[str, Any]]) -> str:
     lines = [
-        "| | env steps/s, in sum | of raw `mj_step` | of another trainer | first env step | memory of a process |",  # noqa: E501
+        "| | env steps/s, in sum | of the simulator alone | of another trainer | first env step | memory of a process |",  # noqa: E501
         "|---|---|---|---|---|---|",
     ]
     for one in found.values():

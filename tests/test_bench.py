@@ -9,7 +9,7 @@ import pytest
 
 from sauna import cli
 from sauna.bench import command, scale
-from sauna.bench.rates import Clock, alternate, physics_rate, ratio
+from sauna.bench.rates import Clock, alternate, physics_rate, ratio, simulator
 from sauna.bench.split import SECTIONS, Timers, split
 from sauna.presets import resolve
 
@@ -56,8 +56,14 @@ def test_sections_add_up_to_a_training_of_a_filtered_arm() -> None:
     assert all(value > 0 for value in found.values()), found
 
 
-def test_physics_is_measured_through_episode_ends() -> None:
-    assert physics_rate("Hopper-v5", {}, processes=1, seconds=0.05) > 0
+@pytest.mark.parametrize("env", ["Hopper-v5", pytest.param("ALE/Pong-v5", marks=pytest.mark.slow)])
+def test_the_simulator_is_measured_through_episode_ends(env: str) -> None:
+    assert physics_rate(env, {}, processes=1, seconds=0.05) > 0
+
+
+def test_simulators_have_names() -> None:
+    known = {"Hopper-v5": "raw mj_step", "ALE/Pong-v5": "ale-py alone", "CartPole-v1": None}
+    assert {env: simulator(env) for env in known} == known
 
 
 def test_points_of_a_scale_keep_the_batch() -> None:
@@ -69,7 +75,7 @@ def test_points_of_a_scale_keep_the_batch() -> None:
 
 def test_the_report_shows_every_figure() -> None:
     result = {
-        "env": "E-v0", "arm": ["ppo"], "members": 6, "processes": 2,
+        "env": "Hopper-v5", "arm": ["ppo"], "members": 6, "processes": 2,
         "rates": {"training": [10.0, 20.0, 30.0], "physics": [40.0, 40.0, 40.0]},
         "ratios": {"physics": {"median": 0.5, "low": 0.25, "high": 0.75}},
         "split": {name: 1.0 for name in SECTIONS},

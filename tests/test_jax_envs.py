@@ -31,6 +31,10 @@ BACKENDS = [
     ("jax_worlds:make_walk", {"limit": 1e9}, 12),
     ("gymnax/Pendulum-v1", {"max_steps_in_episode": 7}, 7),
     ("gymnax/Breakout-MinAtar", {"max_steps_in_episode": 7}, 7),
+    *(
+        pytest.param(f"gymnax/{game}-MinAtar", {"max_steps_in_episode": 7}, 7, marks=slow)
+        for game in ("Asterix", "Freeway", "SpaceInvaders", "Seaquest")
+    ),
     pytest.param("mjx/InvertedPendulum-v5", {"time_limit": 4}, 4, marks=slow),
     pytest.param("playground/CheetahRun", {"episode_length": 3}, 3, marks=slow),
     pytest.param("brax/inverted_pendulum", {"episode_length": 4}, 4, marks=slow),

@@ -15,7 +15,14 @@ from typing import Any
 
 from sauna import rundir
 from sauna.bench.peers import peer_rate, prepare, versions
-from sauna.bench.rates import WARM_UP, alternate, physics_rate, ratio, training_rate
+from sauna.bench.rates import (
+    WARM_UP,
+    alternate,
+    physics_rate,
+    ratio,
+    simulator,
+    training_rate,
+)
 from sauna.bench.scale import scale
 from sauna.errors import BadInput
 from sauna.presets import resolve
@@ -55,7 +62,7 @@ def bench(
     batch = config.rollout_steps * config.envs
     given |= {"steps": batch * (iterations + WARM_UP), "processes": processes}
     measures = {"training": lambda: training_rate(given)}
-    if _has_physics(config.env):
+    if simulator(config.env):
         kwargs = json.loads(config.env_kwargs)
         measures["physics"] = lambda: physics_rate(config.env, kwargs, processes, SECONDS / 3)
     result: dict[str, Any] = {
@@ -107,12 +114,6 @@ def bench_scale(
         "git": rundir.git_revision(),
         "scale": scale(given, rounds, say),
     }
-
-
-def _has_physics(env: str) -> bool:
-    from sauna.envs.backend import is_mujoco
-
-    return is_mujoco(env)
 
 
 def _split_elsewhere(given: Mapping[str, Any], share: int) -> dict[str, float]:
@@ -177,7 +178,9 @@ def report(result: Mapping[str, Any]) -> list[str]:
         f"{result['processes']} processes: {middle['training']:,.0f} env steps/s"
     )
     for name, found in result["ratios"].items():
-        text = "raw mj_step" if name == "physics" else f"{name} in as many processes"
+        text = f"{name} in as many processes"
+        if name == "physics":
+            text = simulator(result["env"]) or name
         lines.append(
             f"  {found['median']:.2f} times {text} ({found['low']:.2f} to {found['high']:.2f}; "
             f"{middle[name]:,.0f} per second)"

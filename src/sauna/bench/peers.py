@@ -22,7 +22,7 @@ from sauna.errors import BadInput, SaunaError
 
 # What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy.
 PEERS = {
-    "sb3": ["stable-baselines3==2.9.2", "gymnasium[mujoco]"],
+    "sb3": ["stable-baselines3==2.9.2", "gymnasium[mujoco]", "ale-py", "opencv-python-headless"],
     "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
 }
 # CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
@@ -48,17 +48,20 @@ def prepare(peer: str, say: Callable[[str], None]) -> Path:
         raise BadInput(f"against: unknown peer {peer!r} (known: {', '.join(PEERS)})")
     folder = cache_folder() / "peers" / peer
     python = folder / "bin" / "python"
-    if not (folder / "complete").exists():
+    done, wanted = folder / "complete", " ".join(PEERS[peer])
+    failed = None
+    if not done.exists():
         say(f"installing {PEERS[peer][0]} and PyTorch (CPU) into {folder}, once")
         venv.create(folder, with_pip=True, clear=True)
         for attempt in _TORCH:
             failed = _pip(python, attempt)
             if failed is None:
                 break
+    if not done.exists() or done.read_text() != wanted:
         failed = failed or _pip(python, PEERS[peer])
         if failed is not None:
             raise SaunaError(f"against: {peer} cannot be installed: {failed}")
-        (folder / "complete").touch()
+        done.write_text(wanted)
     return python
 
 
@@ -137,7 +140,7 @@ def versions(python: Path) -> dict[str, str]:
     """Of what a peer's speed depends on."""
     code = ("import importlib.metadata as m, json; "
             "names = {d.name for d in m.distributions()}; "
-            "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'numpy'); "
+            "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy'); "
             "print(json.dumps({n: m.version(n) for n in wanted if n in names}))")  # fmt: skip
     command = [str(python), "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

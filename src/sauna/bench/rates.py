@@ -1,4 +1,6 @@
-"""Rates in env steps per second: of a whole training, and of MuJoCo's `mj_step` alone.
+"""Rates in env steps per second: of a whole training, and of the simulator alone.
+
+That is MuJoCo's `mj_step`, or ale-py's own vector environment as it comes.
 
 Both use the same number of processes. They are taken alternately, because a machine's speed drifts
 from minute to minute: only ratios of neighbouring measurements mean anything.
@@ -21,7 +23,7 @@ import numpy as np
 from sauna import run as runs
 from sauna.config import Config
 from sauna.errors import SaunaError
-from sauna.presets import Member
+from sauna.presets import PRESETS, Member
 
 WARM_UP = 2  # iterations that are not counted: imports, compilation, first pages of memory
 
@@ -77,11 +79,22 @@ def training_rate(settings: Mapping[str, Any]) -> float:
     return clock.rate()
 
 
-def physics_rate(env: str, env_kwargs: Mapping[str, Any], processes: int, seconds: float) -> float:
-    """Steps per second of `mj_step` alone (with the task's frame skip), in all processes.
+def simulator(env: str) -> str | None:
+    """What steps an environment: `raw mj_step`, `ale-py alone`, or None where it is not known."""
+    from sauna.envs.atari import is_atari
+    from sauna.envs.backend import is_mujoco
 
-    Each process steps three environments in turn, with random actions, through episodes that are
-    begun anew where the task ends them; the time of everything but `mj_step` is left out.
+    if is_atari(env):
+        return "ale-py alone"
+    return "raw mj_step" if is_mujoco(env) else None
+
+
+def physics_rate(env: str, env_kwargs: Mapping[str, Any], processes: int, seconds: float) -> float:
+    """Steps per second of the simulator alone, with random actions, in all processes.
+
+    Each process calls `mj_step` (with the task's frame skip) in three environments in turn, through
+    episodes that are begun anew where the task ends them; the time of everything else is left out.
+    Or it steps a vector of eight Atari games, which ale-py begins anew.
     """
     command = [sys.executable, "-m", __name__, env, json.dumps(dict(env_kwargs)), str(seconds)]
     started = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(processes)]
@@ -147,6 +160,23 @@ def _step_physics(env: str, env_kwargs: dict[str, Any], seconds: float) -> float
     return steps / spent
 
 
+def _step_games(env: str, seconds: float) -> float:
+    """Steps per second of ale-py's vector environment of as many games as the preset has."""
+    from ale_py.vector_env import AtariVectorEnv
+
+    from sauna.envs.atari import game_of
+
+    number, block = PRESETS["atari"]["envs"], 100
+    games = AtariVectorEnv(game_of(env), number)
+    games.reset(seed=0)
+    rng, steps, start = np.random.default_rng(0), 0, time.perf_counter()
+    while time.perf_counter() < start + seconds:
+        for action in rng.integers(0, games.single_action_space.n, (block, number)):
+            games.step(action)
+        steps += block * number
+    return steps / (time.perf_counter() - start)
+
+
 def _state(mujoco: Any, env: Any) -> np.ndarray:
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(env.model, kind))
@@ -159,4 +189,6 @@ def _put(mujoco: Any, env: Any, state: np.ndarray) -> None:
 
 
 if __name__ == "__main__":
-    print(_step_physics(sys.argv[1], json.loads(sys.argv[2]), float(sys.argv[3])))
+    name, kwargs, length = sys.argv[1], json.loads(sys.argv[2]), float(sys.argv[3])
+    games = simulator(name) == "ale-py alone"
+    print(_step_games(name, length) if games else _step_physics(name, kwargs, length))

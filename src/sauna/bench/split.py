@@ -23,6 +23,7 @@ from sauna.collect.host import HostCollector
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import TrainState
 from sauna.envs import mujoco_tasks
+from sauna.envs.atari import AtariEnvs
 from sauna.envs.mujoco_tasks import BatchTask
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
@@ -128,7 +129,9 @@ def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
 
 
 def _physics(envs: Any) -> tuple[Any, str]:
-    """The module and the name of the function that steps MuJoCo here."""
+    """Where the simulator is stepped here: a module or an object, and a function's name."""
+    if isinstance(envs, AtariEnvs):
+        return envs, "_take"
     if isinstance(getattr(envs, "_task", None), BatchTask):
         return mujoco_tasks, "_advance"
     return mujoco, "mj_step"
