@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from sauna.study import dial, noise
+from sauna.study import dial, noise, torso
 from sauna.study.figures import draw_plots, write_figures
-from sauna.study.report import rounded
+from sauna.study.page import rounded
 from sauna.study.results import gather
 from sauna.study.spec import load_spec
 from sauna.study.summary import summarize
@@ -30,7 +31,8 @@ from sauna.study.units import units_of
 
 ROOT = Path(__file__).parent.parent
 STUDIES = ("fig3", "cheetah30", "release")
-MEASURED = {"noise": noise, "dial": dial}  # what `docs/why.md` tells
+MEASURED = {"noise": noise, "dial": dial, "fig5": torso}  # what `docs/why.md` tells
+STILLS = ROOT / "docs" / "why" / "figures" / "stills.png"
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
 POINTS = 30  # of each curve that are committed
 SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8")  # in the README's figure
@@ -81,10 +83,15 @@ def _thinned(cell: dict[str, Any]) -> dict[str, Any]:
 
 def collect_measured(name: str) -> None:
     """`results/NAME.json`: what a study has measured of its members so far, to five digits."""
-    path = ROOT / "runs" / name / f"{name}.json"
+    place = ROOT / "runs" / name
+    path = place / f"{load_spec(name).measure}.json"
     if path.exists():
         text = json.dumps(rounded(json.loads(path.read_text())), separators=(",", ":"))
-        (ROOT / "results" / path.name).write_text(text.replace('{"task"', '\n{"task"') + "\n")
+        text = text.replace('{"task"', '\n{"task"') + "\n"
+        (ROOT / "results" / f"{name}.json").write_text(text)
+    if (place / "figures" / "stills.png").exists():
+        STILLS.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(place / "figures" / "stills.png", STILLS)
 
 
 def load(name: str) -> dict[str, Any] | None:
@@ -209,6 +216,8 @@ def why() -> str:
         drawn = draw_plots(extra.plots, extra.looks, ROOT / "docs" / "why")
         parts.append(f"`{measured['command']}`")
         parts.append("\n".join(f"- {text}" for text in study.verdicts(measured)))
+        if study is torso and STILLS.exists():
+            parts.append(f"![Stills of one pair](why/figures/{STILLS.name})")
         parts += [f"![{p.title}](why/figures/{p.name}.png)\n\n{p.caption}" for p in extra.plots]
         parts.append(_markdown(study.text_table(measured)))
         parts.append(study.ABOUT)

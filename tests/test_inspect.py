@@ -212,7 +212,7 @@ def test_pictures_are_few_small_and_of_their_steps(run) -> None:
         def render(self) -> np.ndarray:
             return np.zeros((400, 800, 3), np.uint8)
 
-    taken = Pictures(Huge(), 1, print)
+    taken = Pictures(Huge(), print)
     for row in range(3 * MOST):
         taken.take(row)
     rows = [row for row, _ in taken.taken]
@@ -221,7 +221,7 @@ def test_pictures_are_few_small_and_of_their_steps(run) -> None:
     limited = Drawn("rgb_array")
     limited.reset(seed=0)
     limited.spec = SimpleNamespace(max_episode_steps=1000)  # type: ignore[assignment]
-    counted = Pictures(limited, 1, print)
+    counted = Pictures(limited, print)
     for row in range(1000):
         counted.take(row)
     assert [row for row, _ in counted.taken] == [*range(0, 1000, 4)]

@@ -16,6 +16,7 @@ from sauna.config import Config
 from sauna.core.normalize import Moments, scale_rewards
 from sauna.core.population import member_keys
 from sauna.core.types import Hypers, Rollout
+from sauna.envs.gymnasium import make_env
 from sauna.inspection.decided import Decisions, advantages, decide, environments
 from sauna.inspection.played import Played, clock, open_world, play_episodes, play_steps
 from sauna.member_state import Counters, under
@@ -23,7 +24,7 @@ from sauna.presets import Member, members
 from sauna.trained import TrainedPolicy
 from sauna.training import hypers_now
 
-LARGEST = 30_000_000  # numbers in the matrix whose principal components are computed
+LARGEST = 10_000_000  # numbers in the matrix whose principal components are computed
 
 
 class Inspection(NamedTuple):
@@ -64,7 +65,7 @@ def examine(
     member = next(one for one in everyone if one.name == name)
     config, iteration = member.config, int(manifest["iteration"])
     kwargs = json.loads(config.env_kwargs)
-    world, drawer = open_world(config.env, kwargs, episodes if pictures else 0, say)
+    world, drawer = open_world(config.env, kwargs, pictures, say)
     policy = TrainedPolicy(artifact, name, world)
     played = play_episodes(policy, world, episodes, deterministic, seed, drawer)
     steps_per_second = clock(world)
@@ -74,7 +75,7 @@ def examine(
     steps, number = len(played.reward), environments(config)
     seen = [played.observation]
     for n in range(1, number):
-        world, _ = open_world(config.env, kwargs, 0, say)
+        world = make_env(config.env, kwargs)
         seen.append(play_steps(policy, world, steps, deterministic, seed, n))
         world.close()
     value, own_vex = policy.predict(played.observation)

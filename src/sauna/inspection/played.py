@@ -36,14 +36,14 @@ class Played(NamedTuple):
 class Pictures:
     """At most `MOST` pictures of a play of any length: when they are more, every second one goes.
 
-    Drawing without a graphics card takes a tenth of a second, so the first guess is as good as it
-    can be: no more than the environment's time limit lets stay.
+    Drawing without a graphics card takes a tenth of a second, so it begins with no more than an
+    episode of the environment's time limit lets stay.
     """
 
-    def __init__(self, env: Any, episodes: int, say: Callable[[str], None]) -> None:
+    def __init__(self, env: Any, say: Callable[[str], None]) -> None:
         self._env, self._say = env, say
         limit = getattr(env.spec, "max_episode_steps", None) or 1
-        self._every = max(1, -(-episodes * limit // MOST), round(clock(env) / PER_SECOND))
+        self._every = max(1, -(-limit // MOST), round(clock(env) / PER_SECOND))
         self._works = True
         self.taken: list[tuple[int, bytes]] = []
 
@@ -106,12 +106,9 @@ class Recorder:
 
 
 def open_world(
-    env: str, kwargs: dict[str, Any], pictures: int, say: Callable[[str], None]
+    env: str, kwargs: dict[str, Any], pictures: bool, say: Callable[[str], None]
 ) -> tuple[Any, Pictures | None]:
     """The environment, and what draws it; where it cannot be drawn, one line says so.
-
-    Args:
-      pictures: of how many episodes; 0: none are wanted.
 
     Raises:
       BadInput: it cannot be made.
@@ -121,7 +118,7 @@ def open_world(
         choose_renderer()
         try:
             world = make_env(env, kwargs, render_mode="rgb_array")
-            return world, Pictures(world, pictures, say)
+            return world, Pictures(world, say)
         except BadInput as error:
             os.environ.clear()
             os.environ.update(chosen)  # a renderer that fails may also fail the plain environment

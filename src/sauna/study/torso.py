@@ -19,7 +19,7 @@ import scipy
 from sauna import style
 from sauna.study.figures import Extra, Line, Panel, Plot
 from sauna.study.statistics import ALPHA, Estimate
-from sauna.study.tables import digits_of, number, table
+from sauna.study.tables import table
 
 TITLE = "On its feet or on its back?"
 ABOUT = (
@@ -103,16 +103,22 @@ def verdicts(measured: Mapping[str, Any]) -> list[str]:
     """The shares and the comparisons as sentences that claim no more than their test."""
     said = []
     for cell in measured["cells"]:
-        found, (value, low, high) = postures(cell), share(postures(cell))
-        if value is not None:
+        found = postures(cell)
+        if found:
             of_all = "" if len(found) == cell["seeds"] else f", of {cell['seeds']} in all,"
             said.append(
                 f"{cell['label']}: on its feet in {sum(one.on_feet for one in found)} of "
-                f"{len(found)} seeds{of_all} ({value:.0%} [{low:.0%}, {high:.0%}])."
+                f"{len(found)} seeds{of_all} ({shown(share(found))})."
             )
     if not said:
         return ["No seed is trained to its end and measured yet."]
     return [*said, *(_compared(pair) for pair in pairs(measured) if pair.seeds)]
+
+
+def shown(estimate: Estimate) -> str:
+    """`25% [11%, 47%]`; `-` where there is none."""
+    value, low, high = estimate
+    return "-" if value is None else f"{value:.0%} [{low:.0%}, {high:.0%}]"
 
 
 def _compared(pair: Pair) -> str:
@@ -127,28 +133,30 @@ def _compared(pair: Pair) -> str:
     )
 
 
-def extra(measured: Mapping[str, Any], place: Path) -> Extra:
-    """The section that the study's page gets; writes `figures/stills.png` where there are stills.
+def extra(measured: Mapping[str, Any], place: Path | None = None) -> Extra:
+    """The section and the figure that the study's page gets.
 
     Args:
-      place: the study's folder.
+      place: the study's folder, where `figures/stills.png` is written if there are stills.
     """
-    head = ("Arm", "Seeds", "On its feet", "Between", "Return on its feet", "Return on its back")
-    rows = [(escape(cell["label"]), _row(cell)) for cell in measured["cells"]]
+    head, *rows = text_table(measured)
     html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(head, rows, name="Postures") if rows else ""
-    return Extra(TITLE, html + _figure(measured, place), plots(measured), {})
+    html += table(head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
+                  name="Postures")  # fmt: skip
+    looks = style.looks({cell["label"]: cell["arm"] for cell in measured["cells"]})
+    return Extra(TITLE, html + (_figure(measured, place) if place else ""), plots(measured), looks)
 
 
-def _row(cell: Mapping[str, Any]) -> list[str]:
-    found = postures(cell)
-    value, low, high = share(found)
-    of_both = ([one.return_ for one in found if one.on_feet is feet] for feet in (True, False))
-    means = [float(np.mean(returns)) if returns else None for returns in of_both]
-    shown = "-" if value is None else f"{number(value, 2)} [{number(low, 2)}, {number(high, 2)}]"
-    between = sum(BETWEEN[0] <= one.upright <= BETWEEN[1] for one in found)
-    digits = digits_of(means)
-    return [str(len(found)), shown, str(between), *(number(mean, digits) for mean in means)]
+def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
+    """The head, and a row for each arm."""
+    rows = [["Arm", "Seeds", "On its feet", "Between", "Return on its feet", "Return on its back"]]
+    for cell in measured["cells"]:
+        found = postures(cell)
+        of_both = ([one.return_ for one in found if one.on_feet is feet] for feet in (True, False))
+        means = [f"{np.mean(returns):,.0f}" if returns else "-" for returns in of_both]
+        between = sum(BETWEEN[0] <= one.upright <= BETWEEN[1] for one in found)
+        rows.append([cell["label"], str(len(found)), shown(share(found)), str(between), *means])
+    return rows
 
 
 def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
@@ -197,7 +205,7 @@ def plots(measured: Mapping[str, Any]) -> list[Plot]:
     for label, one in pair:
         x, y = one.curve["env_steps"], one.curve["explained_variance"]
         lines.append(Line(label, x, y, [None] * len(x), [None] * len(x), []))
-    said = ", ".join(f"{label} {_posture(one)}" for label, one in pair)
+    said = escape(", ".join(f"{label} {_posture(one)}" for label, one in pair))
     caption = f"Of one pair of seeds: {said}. The axis is cut at -1."
     panel = Panel(f"{measured['cells'][0]['task']}, seed {pair[0][1].seed}", lines)
     return [
