@@ -25,13 +25,19 @@ from sauna.core.batch import make_batch
 from sauna.core.types import Hypers, Rollout
 from sauna.errors import BadInput
 from sauna.inspection.decided import advantages, decide
-from sauna.inspection.examined import Inspection, examine, principal_components
-from sauna.inspection.played import MOST, SIDE, Pictures
+from sauna.inspection.examined import (
+    Inspection,
+    _stream,
+    examine,
+    principal_components,
+    scaled,
+)
+from sauna.inspection.played import MOST, SIDE, Pictures, Recorder, _played
 from sauna.selection.filters import decide as decide_stretch
 from sauna.selection.filters import make_filter
 from sauna.selection.vex import make_target
 from sauna.trained import TrainedPolicy
-from worlds import Drawn, Scripted
+from worlds import Drawn, Lives, Scripted
 
 THRESHOLD = 0.9
 
@@ -95,6 +101,22 @@ def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) ->
     np.testing.assert_array_equal(
         made.prediction, vex.mean(1) if decision == "joint" else vex[:, 0]
     )
+
+
+def test_lost_lives_and_signs_are_what_is_learned() -> None:
+    """Three lives of two steps in one game, rewards 5 and -3."""
+    policy: Any = SimpleNamespace(see=np.asarray, predict=lambda x: (np.zeros(len(x)), None))
+    recorder = Recorder(Lives(), policy, None)
+    recorder.reset(seed=0)
+    for _ in range(6):
+        recorder.step(0)
+    played = _played(recorder, [6.0], None)
+    assert played.reward.tolist() == [5.0, -3.0] * 3 and played.terminated.sum() == 1
+    config = configured(arm="ppo", sign_rewards=True, normalize_rewards=False)
+    reward = scaled(config, {}, played.reward)
+    assert reward.tolist() == [1.0, -1.0] * 3
+    stream = _stream(policy, played, reward, np.zeros(6), np.ones(6, bool))
+    assert stream.terminated[:, 0].tolist() == [False, True] * 3
 
 
 @pytest.mark.parametrize("arm", ["sauna", "random-drop"])

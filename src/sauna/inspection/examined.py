@@ -119,6 +119,8 @@ def _hypers(
 
 def scaled(config: Config, own: Mapping[str, np.ndarray], reward: np.ndarray) -> np.ndarray:
     """Raw rewards `[L]` as the value function learns them, with the frozen reward normaliser."""
+    if config.sign_rewards:
+        reward = np.sign(reward)
     if not config.normalize_rewards:
         return reward
     on_host = "reward_moments/variance" in own  # the device keeps it with what it collects
@@ -136,7 +138,7 @@ def _stream(
     next_value[ends] = np.where(played.truncated[ends], policy.predict(played.final)[0], 0.0)
     column: Any = {
         "reward": reward.astype(np.float32), "value": value, "next_value": next_value,
-        "terminated": played.terminated, "truncated": played.truncated,
+        "terminated": played.terminated | played.life_lost, "truncated": played.truncated,
         "valid": np.ones(len(value), bool), "keep": keep,
     }  # fmt: skip
     nothing = np.zeros(len(value), np.float32)  # what GAE does not read
@@ -152,9 +154,9 @@ def principal_components(
     Of each component the sign is such that its largest loading is positive. None where the matrix
     is too large.
     """
-    flat = observation.reshape(len(observation), -1).astype(np.float64)
-    if flat.size > LARGEST:
+    if observation.size > LARGEST:
         return None, []
+    flat = observation.reshape(len(observation), -1).astype(np.float64)
     left, scale, loadings = np.linalg.svd(flat - flat.mean(0), full_matrices=False)
     largest = np.abs(loadings).argmax(1)
     scores = left * scale * np.sign(loadings[np.arange(len(loadings)), largest])

@@ -28,6 +28,7 @@ class Played(NamedTuple):
     reward: np.ndarray  # [L] float64, raw
     terminated: np.ndarray  # [L] bool
     truncated: np.ndarray  # [L] bool, never together with terminated
+    life_lost: np.ndarray  # [L] bool, an end for learning alone
     final: np.ndarray  # [E, *obs] what the network would have got where episode e ended
     returns: list[float]  # [E] of raw rewards
     pictures: list[tuple[int, bytes]]  # env step, WebP of the state before it
@@ -86,7 +87,7 @@ class Recorder:
         self._now: Any = None
         self.observation: list[np.ndarray] = []
         self.final: list[np.ndarray] = []
-        self.told: list[tuple[float, bool, bool]] = []
+        self.told: list[tuple[float, bool, bool, bool]] = []
 
     def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
         observation, info = self._env.reset(seed=seed)
@@ -98,7 +99,9 @@ class Recorder:
             self._pictures.take(len(self.told))
         observation, reward, terminated, truncated, info = self._env.step(action)
         self.observation.append(self._now)
-        self.told.append((float(reward), bool(terminated), bool(truncated and not terminated)))
+        lost = bool(info.get("life_lost", False))
+        truncated = bool(truncated and not terminated)
+        self.told.append((float(reward), bool(terminated), truncated, lost))
         self._now = self._see(observation)
         if terminated or truncated:
             self.final.append(self._now)
@@ -152,12 +155,14 @@ def play_steps(
 
 
 def _played(recorder: Recorder, returns: list[float], pictures: Pictures | None) -> Played:
-    reward, terminated, truncated = (np.array(x) for x in zip(*recorder.told, strict=True))
+    told = (np.array(x) for x in zip(*recorder.told, strict=True))
+    reward, terminated, truncated, life_lost = told
     return Played(
         np.stack(recorder.observation),
         reward,
         terminated,
         truncated,
+        life_lost,
         np.stack(recorder.final),
         returns,
         pictures.taken if pictures else [],
