@@ -30,7 +30,8 @@ from sauna.study.tables import PAPER
 from sauna.study.units import units_of
 
 ROOT = Path(__file__).parent.parent
-STUDIES = ("fig3", "cheetah30", "release")
+STUDIES = ("fig3", "cheetah30", "release", "minatar", "pong")
+DRAWN = ("fig3", "minatar", "pong")  # whose curves are pictures in docs/
 MEASURED = {"noise": noise, "dial": dial, "fig5": torso}  # what `docs/why.md` tells
 STILLS = ROOT / "docs" / "why" / "figures" / "stills.png"
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
@@ -167,8 +168,9 @@ def document() -> str:
         "# What was found",
         "Made by `python results/make.py` from the files in `results/`; trained by "
         "`python results/make.py --train`. Training return (sampled actions), mean of the last "
-        "100 episodes; 10^6 env steps unless an arm says otherwise. The paper's numbers are of "
-        "version 2 of the tasks and of kept steps: compare arms within a column, not across.",
+        "100 episodes; 10^6 env steps unless an arm says otherwise (minatar: 3 x 10^6). The "
+        "paper's numbers are of version 2 of the tasks and of kept steps: compare arms within a "
+        "column, not across.",
         "A verdict needs an exact Mann-Whitney test, corrected by Holm's method for the arms of a "
         "task, and an interval of P(better) that leaves out one half. It is not corrected for the "
         "number of tasks. The interval of an IQM is a percentile bootstrap, which is too narrow "
@@ -240,14 +242,28 @@ def insert(path: Path, name: str, text: str) -> None:
 
 
 def figures(name: str, results: dict[str, Any]) -> None:
-    """The README's picture: learning curves of the arms that decide."""
+    """Learning curves (fig3's are the README's picture) of the arms that decide."""
     chosen = [cell for cell in results["cells"] if cell["label"] in SHOWN]
     shown = {**results, "cells": chosen}
     drawn = write_figures(shown, summarize(shown), ROOT / "docs" / name)
+    kept = ["learning_curves.png", *(["keep_rate.png"] if len(chosen) > 1 else [])]
     for path in (ROOT / "docs" / name / "figures").iterdir():
-        if path.name not in ("learning_curves.png", "keep_rate.png"):
+        if path.name not in kept:
             path.unlink()
     assert drawn
+
+
+def pong(results: dict[str, Any]) -> str:
+    """How the one seed of `pong` went, and its curve."""
+    member = results["cells"][0]["members"][0]
+    steps, score = (member["curve"][key] for key in ("env_steps", "return_mean"))
+    told = [(n, x) for n, x in zip(steps, score, strict=True) if x is not None]
+    (early, low), (late, high) = told[0], told[-1]
+    text = (
+        f"PPO, one seed (`{results['command']}`): the mean training score of the last 100 games is "
+        f"{low:.1f} after {early:,} env steps and {high:.1f} after {late:,}."
+    )
+    return f"{text}\n\n![Pong, one seed](pong/figures/learning_curves.png)"
 
 
 def main() -> None:
@@ -264,10 +280,13 @@ def main() -> None:
             collect_measured(name)
     (ROOT / "docs" / "why.md").write_text(why())
     (ROOT / "docs" / "results.md").write_text(document())
-    results = load("fig3")
-    if results is not None:
-        insert(ROOT / "README.md", "ppo", ppo_table(results))
-        figures("fig3", results)
+    found = {name: results for name in DRAWN if (results := load(name))}
+    for name, results in found.items():
+        figures(name, results)
+    if "fig3" in found:
+        insert(ROOT / "README.md", "ppo", ppo_table(found["fig3"]))
+    if "pong" in found:
+        insert(ROOT / "docs" / "atari.md", "pong", pong(found["pong"]))
 
 
 if __name__ == "__main__":
