@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -198,4 +199,4 @@ def meaning(found: Inspection) -> str:
 def command(found: Inspection, run: Path) -> str:
     flags = f" --episodes {len(found.played.returns)} --seed {found.seed}"
     flags += " --deterministic" * (found.mode == "deterministic")
-    return f"sauna inspect {run} --member {found.member.name}{flags}"
+    return f"sauna inspect {shlex.quote(str(run))} --member {found.member.name}{flags}"

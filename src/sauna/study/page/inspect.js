@@ -119,8 +119,10 @@
     function domain() {
       const inView = (name) => series[name].slice(view[0], view[1] + 1);
       const edge = panel.band ? inView(panel.band) : [];
-      const all = [...panel.lines.flatMap(inView), ...edge, ...edge.map((y) => y == null ? null : -y)];
-      const [low, high] = extent(all);
+      const lines = panel.lines.flatMap(inView);
+      // The band's mirror image below 0 matters only where a line comes near it.
+      const mirrored = lines.some((y) => y < 0) ? edge.map((y) => y == null ? null : -y) : [];
+      const [low, high] = extent([...lines, ...edge, ...mirrored]);
       return [low - 0.05 * (high - low), high + 0.05 * (high - low)];
     }
 
