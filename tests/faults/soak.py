@@ -68,11 +68,13 @@ def slope(hours: np.ndarray, values: np.ndarray) -> dict[str, float]:
     import scipy.stats
 
     x, y = (np.array([part.mean() for part in np.array_split(v, BLOCKS)]) for v in (hours, values))
-    fit = scipy.stats.linregress(x, y)
-    half = float(scipy.stats.t.isf(0.025, BLOCKS - 2)) * float(fit.stderr)
+    change, half = 0.0, 0.0
+    if np.ptp(y) > 0:  # what never changes has no correlation, and a slope of 0
+        fit = scipy.stats.linregress(x, y)
+        change = float(fit.slope)
+        half = float(scipy.stats.t.isf(0.025, BLOCKS - 2)) * float(fit.stderr)
     return {"mean": float(values.mean()), "largest": float(values.max()),
-            "per_hour": float(fit.slope), "low": float(fit.slope) - half,
-            "high": float(fit.slope) + half}  # fmt: skip
+            "per_hour": change, "low": change - half, "high": change + half}  # fmt: skip
 
 
 def watch(command: list[str], minutes: float) -> tuple[list[dict[str, float]], int]:
