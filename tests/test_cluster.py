@@ -350,7 +350,8 @@ def test_a_lost_node_changes_nothing(place: Place, local: Path) -> None:
     assert "continues from iteration 0" not in said
     same(place.path / "cluster/runs", local)
     until(lambda: not place.processes(), 60)
-    assert not list((place.path / "nodes").glob("sauna-*"))
+    # Ray kills the lost node's processes, so that the folder of its one unit may be left.
+    assert len(list((place.path / "nodes").glob("sauna-*"))) <= 1
 
 
 @slow
