@@ -35,7 +35,7 @@ from sauna.envs.gymnasium import EnvironmentFailure
 from sauna.envs.jax_env import flat
 from sauna.envs.jax_native import make_jax_env
 from sauna.errors import BadInput
-from sauna.machines import check_shared, join, read_place, same, share, tell
+from sauna.machines import check_shared, join, leave, read_place, same, share, tell
 from sauna.member_state import (
     Counters,
     fitting,
@@ -68,6 +68,7 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     place = read_place(config.distributed)
     join(place)
     if not same(place, _settings(job)):
+        leave()
         raise BadInput("distributed: the machines have different settings or versions; give each "
                        "the same command but for its index")  # fmt: skip
     population = make_population(job)
