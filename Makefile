@@ -1,6 +1,6 @@
 # make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
 # make test   install into .venv, run the tests
-# make test-slow  the tests that take minutes; installs what they need besides (Ray)
+# make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
 # make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
 # make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
@@ -26,8 +26,8 @@ BIN := .venv/bin
 	$(BIN)/pip install --quiet -e '.[dev]'
 	@touch $@ .venv/.run
 
-.venv/.cluster: .venv/bin/python pyproject.toml
-	$(BIN)/pip install --quiet -e '.[dev,cluster]'
+.venv/.slow: .venv/bin/python pyproject.toml
+	$(BIN)/pip install --quiet -e '.[dev,cluster,brax,playground]'
 	@touch $@ .venv/.dev .venv/.run
 
 setup: .venv/.dev
@@ -38,7 +38,7 @@ demo: .venv/.run
 test: .venv/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
 
-test-slow: .venv/.cluster
+test-slow: .venv/.slow
 	$(BIN)/python -m pytest -m slow
 
 campaign: .venv/.dev
