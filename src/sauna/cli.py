@@ -17,10 +17,9 @@ from sauna import __version__
 from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.errors import BadInput, Interrupted, SaunaError, nearest
 from sauna.presets import ARM_HELP, COMPARED, PRESET_HELP, given_by, parse_all
+from sauna.study.spec import DECIDED
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
-# Fields that a comparison decides itself.
-_STUDYS = ("env", "arm", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
 
 
@@ -78,7 +77,7 @@ def make_parser() -> argparse.ArgumentParser:
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=text)
-    _add_fields(compare, [n for n in FIELDS if n not in _STUDYS])
+    _add_fields(compare, [n for n in FIELDS if n not in (*DECIDED, "arm")])
 
     study = commands.add_parser("study", help="run a study of the paper's, or your own",
                                 allow_abbrev=False)  # fmt: skip

@@ -35,8 +35,9 @@ from sauna.config import FIELDS, Config, check_read, parse
 from sauna.errors import BadInput, nearest
 from sauna.presets import ARMS, FIXED, arm_config, parse_all, resolve
 
-# What a study decides itself.
-_OWN = ("env", "out", "processes", "drop_rate_from", "seeds", "tensorboard", "distributed")
+# Settings that a study or a comparison decides itself.
+DECIDED = ("env", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
+_OWN = (*DECIDED, "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
 MEASURES = ("noise", "dial", "torso")
