@@ -35,8 +35,9 @@ setup: .venv/.dev
 demo: .venv/.run
 	$(BIN)/sauna train InvertedPendulum-v5 --arm sauna --seeds 3 --steps 100000
 
+# Half of the time of a first run is compiling: here without LLVM's optimisations.
 test: .venv/.dev
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
 
 test-slow: .venv/.slow
 	$(BIN)/python -m pytest -m slow

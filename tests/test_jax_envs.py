@@ -179,10 +179,8 @@ def test_ten_members_solve_cartpole(arm: str) -> None:
     assert min(recorder.best.values()) > 475, recorder.best
 
 
-@pytest.mark.parametrize(
-    "env",
-    [pytest.param("playground/CheetahRun", marks=slow), "sauna/HumanoidFlagrunHarder-v0"],
-)
+@slow
+@pytest.mark.parametrize("env", ["playground/CheetahRun", "sauna/HumanoidFlagrunHarder-v0"])
 def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path) -> None:
     """As a user would; XLA is told not to optimise, which would take longer than the training."""
     run = tmp_path / "run"
