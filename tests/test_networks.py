@@ -14,8 +14,9 @@ from scipy import stats
 
 from helpers import configured, make_job, train_here
 from sauna.collect.actor import make_actor
+from sauna.core.convolutions import LAYERS, convolutions
 from sauna.core.distributions import bernoulli, gaussian, multi_categorical
-from sauna.core.networks import Convolution, NatureCNN
+from sauna.core.networks import NatureCNN
 from sauna.core.policy import make_policy
 from sauna.errors import BadInput
 from sauna.member_state import flat_params, named_params
@@ -144,29 +145,52 @@ def test_the_nature_cnn_by_hand() -> None:
     assert sum(sizes.values()) == 1_684_128
 
 
-@pytest.mark.parametrize("kernel, stride, height, width", [(8, 4, 21, 24), (3, 1, 5, 7)])
-def test_a_convolution_is_one(kernel: int, stride: int, height: int, width: int) -> None:
-    """Against XLA's, with its gradients, where pixels at the edges are left over, too."""
-    layer = Convolution(5, kernel, stride)
-    x = np.random.default_rng(0).normal(size=(2, height, width, 3)).astype(np.float32)
-    params = jax.jit(layer.init)(jax.random.key(0), x)
-
-    def theirs(params, x):
-        own = params["params"]
-        y = jax.lax.conv_general_dilated(x, own["kernel"], (stride,) * 2, "VALID",
+def theirs(layers, x):
+    """`convolutions` with XLA's own."""
+    for (kernel, bias), (_, _, stride) in zip(layers, LAYERS, strict=True):
+        x = jax.lax.conv_general_dilated(x, kernel, (stride,) * 2, "VALID",
                                          dimension_numbers=("NHWC", "HWIO", "NHWC"))  # fmt: skip
-        return y + own["bias"]
+        x = jax.nn.relu(x + bias)
+    return x
+
+
+@pytest.mark.parametrize("pictures", [1, 8, 11])
+def test_convolutions_are_xlas(pictures: int) -> None:
+    """With their gradients, in whole pieces and not, where pixels are left over at the edges."""
+    random = np.random.default_rng(0)
+    x = random.normal(size=(pictures, 39, 42, 3)).astype(np.float32)
+    layers, channels = [], 3
+    for features, width, _ in LAYERS:
+        kernel = random.normal(size=(width, width, channels, features)) / width
+        layers.append((kernel.astype(np.float32), random.normal(size=features).astype(np.float32)))
+        channels = features
 
     def of(function):
-        def squares(params, x):
-            y = function(params, x)
-            return (y**2).sum(), y
+        def squares(layers, x):
+            y = function(layers, x)
+            return (y**2).mean(), y
 
-        return jax.jit(jax.grad(squares, (0, 1), has_aux=True))(params, x)
+        return jax.jit(jax.grad(squares, (0, 1), has_aux=True))(layers, x)
 
-    ours, expected = jax.tree.leaves(of(layer.apply)), jax.tree.leaves(of(theirs))
+    ours, expected = jax.tree.leaves(of(convolutions)), jax.tree.leaves(of(theirs))
     for one, other in zip(ours, expected, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-3)
+        scale = np.abs(other).max()
+        np.testing.assert_allclose(one / scale, other / scale, rtol=1e-4, atol=1e-5)
+
+
+def test_the_gradient_of_bytes_is_that_of_their_shares() -> None:
+    config = dataclasses.replace(configured(trunk="shared"), network="nature-cnn")
+    policy = make_policy(config, IMAGE)
+    flat = policy.init(jax.random.key(0))
+    image = np.random.default_rng(0).integers(0, 256, (9, 40, 40, 2)).astype(np.uint8)
+
+    @jax.jit
+    def gradient(x):
+        return jax.grad(lambda flat: (policy.apply(flat, x).value ** 2).mean())(flat)
+
+    of_bytes, of_shares = gradient(image), gradient(image.astype(np.float32) / 255.0)
+    assert np.abs(of_bytes).max() > 0
+    np.testing.assert_allclose(of_bytes, of_shares, rtol=1e-4, atol=1e-5)
 
 
 def test_named_parameters_go_round() -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import flax.linen as nn
 import jax.numpy as jnp
 
+from sauna.core.convolutions import LAYERS, Layer, convolutions
 from sauna.core.types import Array, PolicyOutput
 
 
@@ -35,46 +36,16 @@ class MLP(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A VALID convolution `[B, H, W, C]` -> `[B, H', W', F]` as a few products of matrices.
-
-    The picture is cut into blocks of `stride` x `stride` pixels, after which the kernel moves by
-    one; then one product per row of the kernel. XLA's own convolution is many times slower than
-    this on a CPU, because its gradient inside a loop (and every update is one) has no fast path.
-
-    Attributes:
-      features: F; kernel: its width and height, a multiple of `stride`.
-    """
+    """The parameters of one of `convolutions`: kernel `[K, K, C, F]` and bias `[F]`."""
 
     features: int
-    kernel: int
-    stride: int
+    width: int
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
-        shape = (self.kernel, self.kernel, x.shape[-1], self.features)
-        weight = self.param("kernel", nn.initializers.orthogonal(math.sqrt(2.0)), shape)
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        across = self.kernel // self.stride  # blocks that the kernel covers
-        blocks = into_blocks(x, self.kernel, self.stride)
-        width = blocks.shape[2] - across + 1
-        beside = jnp.concatenate([blocks[:, :, j : j + width] for j in range(across)], -1)
-        if beside.dtype == jnp.uint8:
-            beside = beside.astype(jnp.float32) / 255.0
-        per_block = (across, self.stride, across, self.stride, -1, self.features)
-        rows = weight.reshape(per_block).transpose(0, 2, 1, 3, 4, 5)
-        rows = rows.reshape(across, -1, self.features)
-        height = blocks.shape[1] - across + 1
-        return sum((beside[:, i : i + height] @ rows[i] for i in range(across)), start=bias)
-
-
-def into_blocks(x: Array, kernel: int, stride: int) -> Array:
-    """`[B, H, W, C]` -> `[B, H / stride, W / stride, stride * stride * C]`.
-
-    Pixels that no step of the kernel reaches are cut off.
-    """
-    height, width = ((n - kernel) // stride * stride + kernel for n in x.shape[1:3])
-    x = x[:, :height, :width].reshape(len(x), height // stride, stride, width // stride, -1)
-    return x.transpose(0, 1, 3, 2, 4).reshape(len(x), height // stride, width // stride, -1)
+    def __call__(self, channels: int) -> Layer:
+        shape = (self.width, self.width, channels, self.features)
+        kernel = self.param("kernel", nn.initializers.orthogonal(math.sqrt(2.0)), shape)
+        return kernel, self.param("bias", nn.initializers.zeros, (self.features,))
 
 
 class NatureCNN(nn.Module):
@@ -87,8 +58,11 @@ class NatureCNN(nn.Module):
     def __call__(self, observation: Array) -> Array:
         lead = observation.shape[:-3]
         x = observation.reshape((-1, *observation.shape[-3:]))
-        for i, (features, kernel, stride) in enumerate([(32, 8, 4), (64, 4, 2), (64, 3, 1)]):
-            x = nn.relu(Convolution(features, kernel, stride, name=f"conv_{i}")(x))
+        layers, channels = [], x.shape[-1]
+        for i, (features, width, _) in enumerate(LAYERS):
+            layers.append(Convolution(features, width, name=f"conv_{i}")(channels))
+            channels = features
+        x = convolutions(layers, x)
         x = nn.relu(dense(512, math.sqrt(2.0), "dense")(x.reshape((x.shape[0], -1))))
         return x.reshape((*lead, -1))
 
