@@ -87,7 +87,8 @@ def collect_measured(name: str) -> None:
     place = ROOT / "runs" / name
     path = place / f"{load_spec(name).measure}.json"
     if path.exists():
-        text = json.dumps(rounded(json.loads(path.read_text())), separators=(",", ":"))
+        found = {**json.loads(path.read_text()), "command": f"sauna study {name}"}
+        text = json.dumps(rounded(found), separators=(",", ":"))
         text = text.replace('{"task"', '\n{"task"') + "\n"
         (ROOT / "results" / f"{name}.json").write_text(text)
     if (place / "figures" / "stills.png").exists():
