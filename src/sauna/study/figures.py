@@ -195,8 +195,8 @@ def _draw(plot: Plot, looks: Mapping[str, style.Look]) -> Any:
 
     drawn = {line.label for panel in plot.panels for line in panel.lines}
     texts = {label: fill(label, WRAP) for label in looks if label in drawn}
-    columns = min(COLUMNS, len(plot.panels))
-    rows = -(-len(plot.panels) // columns)
+    rows = -(-len(plot.panels) // COLUMNS)
+    columns = -(-len(plot.panels) // rows)
     width = 3.6 * columns if columns > 1 else 5.4
     longest = max(len(line) for text in texts.values() for line in text.splitlines())
     legend_columns = max(1, int(width * 11 / (longest + 9)))
