@@ -16,8 +16,7 @@ from typing import Any, NoReturn
 from sauna import __version__
 from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.errors import BadInput, Interrupted, SaunaError, nearest
-from sauna.presets import ARM_HELP, COMPARED, PRESET_HELP, given_by, parse_all
-from sauna.study.spec import DECIDED
+from sauna.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study

@@ -112,6 +112,9 @@ ARM_HELP = {
 # The arms of a comparison where none are named; the first is the baseline.
 COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
 
+# Settings that a study or a comparison decides itself.
+DECIDED = ("env", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
+
 # What makes an arm what its name says; the user's own values do not apply to these.
 FIXED: dict[str, tuple[str, ...]] = {
     "ppo": ("filter", "vex_coef"),

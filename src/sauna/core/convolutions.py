@@ -8,6 +8,7 @@ the cache holds; the gradients of the weights are added up on the way.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +48,7 @@ def _backward(
     layers, x, outputs = saved
     has_gradient = jnp.issubdtype(x.dtype, jnp.floating)  # bytes have none
 
-    def piece(total: list[Layer], of: tuple[Array, list[Array], Array]):  # type: ignore[no-untyped-def]
+    def piece(total: list[Layer], of: tuple[Array, list[Array], Array]) -> tuple[list[Layer], Any]:
         x, outputs, d = of
         gradients: list[Layer] = []
         for i in reversed(range(len(LAYERS))):

@@ -33,10 +33,8 @@ from typing import Any, NamedTuple
 
 from sauna.config import FIELDS, Config, check_read, parse
 from sauna.errors import BadInput, nearest
-from sauna.presets import ARMS, FIXED, arm_config, parse_all, resolve
+from sauna.presets import ARMS, DECIDED, FIXED, arm_config, parse_all, resolve
 
-# Settings that a study or a comparison decides itself.
-DECIDED = ("env", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
 _OWN = (*DECIDED, "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
