@@ -44,6 +44,11 @@ def scores_with_u(u: int, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
+def against(x: np.ndarray, y: np.ndarray) -> s.Comparison:
+    """Of a single question."""
+    return s.compare({"": (x, y)})[""]
+
+
 def test_iqm_by_hand() -> None:
     assert s.iqm(np.array([1.0, 2.0, 3.0])) == 2  # fewer than four: nothing is cut
     assert s.iqm(np.array([100.0, 1.0, 2.0, -50.0])) == 1.5
@@ -189,10 +194,7 @@ def test_noethers_number_gives_about_the_power_it_promises() -> None:
     random = np.random.default_rng(0)
     chance = 0.76
     n, shift = s.seeds_needed(chance), stats.norm.ppf(chance) * math.sqrt(2)
-    found = [
-        s.compare({"x": random.normal(shift, 1, n)}, random.normal(size=n))["x"].kind
-        for _ in range(300)
-    ]
+    found = [against(random.normal(shift, 1, n), random.normal(size=n)).kind for _ in range(300)]
     assert 0.75 < found.count("better") / 300 < 0.92
 
 
@@ -221,7 +223,7 @@ def test_equal_distributions_are_called_different_in_at_most_5_percent(n: int, m
     for u in range(n * m + 1):
         x, y = scores_with_u(u, n, m)
         cumulative = stats.mannwhitneyu(x, y, alternative="less", method="exact").pvalue
-        kind = s.compare({"x": x}, y)["x"].kind
+        kind = against(x, y).kind
         wrong += (cumulative - below) * (kind in ("better", "worse"))
         below = cumulative
     assert wrong <= 0.05
@@ -233,9 +235,7 @@ def test_equal_distributions_are_called_different_in_at_most_5_percent(n: int, m
 def test_false_findings_in_simulation(scores, n: int) -> None:
     """The same by drawing; 2.5 standard errors of 600 draws above 5%."""
     random, trials = np.random.default_rng(n), 600
-    kinds = [
-        s.compare({"x": scores(random, n)}, scores(random, n))["x"].kind for _ in range(trials)
-    ]
+    kinds = [against(scores(random, n), scores(random, n)).kind for _ in range(trials)]
     wrong = (kinds.count("better") + kinds.count("worse")) / trials
     assert wrong <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / trials)
     assert (kinds.count("too few") == trials) == (n == 3)
@@ -247,7 +247,8 @@ def test_false_findings_among_several_arms_and_without_holm() -> None:
     for _ in range(trials):
         arms = {name: normal(random, 6) for name in "abcd"}
         baseline = normal(random, 6)
-        with_holm += any(c.kind != "no evidence" for c in s.compare(arms, baseline).values())
+        found = s.compare({name: (x, baseline) for name, x in arms.items()})
+        with_holm += any(c.kind != "no evidence" for c in found.values())
         without += any(s.exact_p(x, baseline) < 0.05 for x in arms.values())
     assert with_holm / trials <= 0.05
     assert without / trials > 0.08
@@ -269,26 +270,26 @@ def test_the_interval_covers_where_a_bootstrap_does_not() -> None:
 
 def test_verdicts() -> None:
     low, high = np.arange(6.0), np.arange(6.0) + 10
-    assert s.compare({"x": high}, low)["x"].kind == "better"
-    assert s.compare({"x": low}, high)["x"].kind == "worse"
-    assert s.compare({"x": low + 0.1}, low)["x"].kind == "no evidence"
-    few = s.compare({"x": high[:3]}, low[:3])["x"]
+    assert against(high, low).kind == "better"
+    assert against(low, high).kind == "worse"
+    assert against(low + 0.1, low).kind == "no evidence"
+    few = against(high[:3], low[:3])
     assert (few.kind, few.least, few.needed) == ("too few", 4, 6)
-    assert s.compare({"x": high[:0]}, low)["x"] == ("too few", (None, None, None), 1.0, 4, None)
-    assert s.compare({"x": high[:1]}, low)["x"].needed is None
-    assert s.compare({"x": high[:2]}, np.arange(8.0))["x"].kind == "too few"  # by the interval
-    assert s.compare({}, low) == {}
+    assert against(high[:0], low) == ("too few", (None, None, None), 1.0, 4, None)
+    assert against(high[:1], low).needed is None
+    assert against(high[:2], np.arange(8.0)).kind == "too few"  # by the interval
+    assert s.compare({}) == {}
 
 
 def test_holm_can_undo_a_verdict_and_raise_the_least_number_of_seeds() -> None:
     x, y = scores_with_u(5, 6, 6)  # exact p = 0.0411
-    assert s.compare({"x": x}, y)["x"].kind == "worse"
-    both = s.compare({"x": x, "other": y + 0.1}, y)
+    assert against(x, y).kind == "worse"
+    both = s.compare({"x": (x, y), "other": (y + 0.1, y)})
     assert both["x"].kind == "no evidence"
     np.testing.assert_allclose(both["x"].p, 2 * s.exact_p(x, y))
     parted = np.arange(4.0) + 10
-    assert s.compare({"x": parted}, np.arange(4.0))["x"].kind == "better"
-    assert s.compare({"x": parted, "z": parted}, np.arange(4.0))["x"].kind == "too few"
+    assert against(parted, np.arange(4.0)).kind == "better"
+    assert s.compare({name: (parted, np.arange(4.0)) for name in "xz"})["x"].kind == "too few"
 
 
 def test_over_tasks_by_hand_and_never_narrower_than_the_bootstrap() -> None:

@@ -255,41 +255,39 @@ def seeds_needed(chance: float, comparisons: int = 1, power: float = POWER) -> i
     return max(math.ceil(z**2 / (6 * (chance - 0.5) ** 2)), least_seeds(comparisons))
 
 
-def compare(arms: Mapping[str, np.ndarray], baseline: np.ndarray) -> dict[str, Comparison]:
-    """Each arm's scores against the baseline's, on one task.
+def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Comparison]:
+    """Two arms' scores against each other, for each of a family of questions: other arms on one
+    task, or one arm on other tasks.
 
     `better` and `worse` need both: the exact test below `ALPHA` after Holm's correction over the
-    arms, and an interval that leaves 1/2 out. Where arm and baseline have equal distributions, of
-    whatever shape, that is wrong with a chance of at most `ALPHA`. Where only their spreads differ
-    it is wrong a little more often: in 6% to 8% of trials with 6 to 30 seeds of each and a spread
-    five times the other, in 11% to 13% where the arm of lesser spread also has twice the seeds.
+    family, and an interval that leaves 1/2 out. Where both have equal distributions, of whatever
+    shape, that is wrong with a chance of at most `ALPHA`. Where only their spreads differ it is
+    wrong a little more often: in 6% to 8% of trials with 6 to 30 seeds of each and a spread five
+    times the other, in 11% to 13% where the arm of lesser spread also has twice the seeds.
 
     `too few` is where not even perfectly parted scores would pass. `needed` is None where a single
     seed, or no difference, is all there is.
 
     Args:
-      arms: label -> scores `[n]`, possibly empty.
-      baseline: `[m]`, possibly empty.
+      pairs: name -> the scores of an arm `[n]` and of its baseline `[m]`, possibly empty.
     """
-    p_values = holm([exact_p(x, baseline) for x in arms.values()])
-    lowest = holm([2 / math.comb(len(x) + len(baseline), len(x)) for x in arms.values()])
+    p_values = holm([exact_p(x, y) for x, y in pairs.values()])
+    lowest = holm([2 / math.comb(len(x) + len(y), len(x)) for x, y in pairs.values()])
     return {
-        label: _comparison(x, baseline, p, lowest_p, len(arms))
-        for (label, x), p, lowest_p in zip(arms.items(), p_values, lowest, strict=True)
+        name: _comparison(x, y, p, lowest_p, len(pairs))
+        for (name, (x, y)), p, lowest_p in zip(pairs.items(), p_values, lowest, strict=True)
     }
 
 
-def _comparison(
-    x: np.ndarray, baseline: np.ndarray, p: float, lowest_p: float, arms: int
-) -> Comparison:
-    n, m = len(x), len(baseline)
+def _comparison(x: np.ndarray, y: np.ndarray, p: float, lowest_p: float, family: int) -> Comparison:
+    n, m = len(x), len(y)
     if min(n, m) == 0:
-        return Comparison("too few", Estimate(None, None, None), p, least_seeds(arms), None)
-    estimate = improvement_estimate(x, baseline)
-    needed = None if estimate.low is None else seeds_needed(improvement(x, baseline), arms)
+        return Comparison("too few", Estimate(None, None, None), p, least_seeds(family), None)
+    estimate = improvement_estimate(x, y)
+    needed = None if estimate.low is None else seeds_needed(improvement(x, y), family)
     reachable = lowest_p < ALPHA and _lower_end(1.0, n, m) > 0.5
     kind = _kind(estimate, p) if reachable else "too few"
-    return Comparison(kind, estimate, p, least_seeds(arms), needed)
+    return Comparison(kind, estimate, p, least_seeds(family), needed)
 
 
 def _kind(estimate: Estimate, p: float) -> str:

@@ -109,8 +109,9 @@ def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
     scores = {cell.label: cell.values("final_return") for cell in cells}
     found: dict[str, Comparison] = {}
     for baseline in dict.fromkeys(cell.baseline for cell in cells if cell.baseline):
-        own = {cell.label: scores[cell.label] for cell in cells if cell.baseline == baseline}
-        found |= compare(own, scores.get(baseline, np.zeros(0)))
+        base = scores.get(baseline, np.zeros(0))
+        family = [cell.label for cell in cells if cell.baseline == baseline]
+        found |= compare({label: (scores[label], base) for label in family})
     return {cell.label: found[cell.label] for cell in cells if cell.baseline}
 
 

@@ -1,0 +1,127 @@
+"""The paper's claims about scores, each held against the members trained here.
+
+A claim is a family of tests: an arm against another on every task of a study, corrected together.
+So it is judged more strictly than the verdicts of one task, which are corrected for arms only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sauna.study.statistics import Estimate, compare, improvement_over_tasks
+from sauna.study.summary import UNFILTERED
+
+VARIANTS = ("sauna", "sauna 0.8", "sauna-paper")
+REFERENCES = ("sauna-reference", "sauna-reference, kept steps")
+
+
+class Claim(NamedTuple):
+    """`pairs` of arms of which the first should score higher."""
+
+    text: str
+    pairs: tuple[tuple[str, str], ...]
+    score: str = "final_return"
+
+
+_AGAINST_PPO = (
+    *((label, "ppo") for label in VARIANTS),
+    *((label, "ppo, limits end") for label in REFERENCES),
+)
+CLAIMS = (
+    Claim("SAUNA scores higher than PPO, on every task (Table 1, Fig. 2)", _AGAINST_PPO),
+    Claim("It learns sooner: a larger area under the curve (Fig. 2)", _AGAINST_PPO, "area"),
+    Claim(
+        "Dropping steps does it, not the head that is trained along (section 4.2, Fig. 3)",
+        tuple((label, "vex-head") for label in VARIANTS),
+    ),
+    Claim("The head helps even where nothing is dropped (asked in 4.2)", (("vex-head", "ppo"),)),
+    Claim(
+        "Which steps are dropped matters, not how many (not in the paper)",
+        (("sauna 0.8", "random-drop"),),
+    ),
+)
+HEADER = ["claim", "arm", "against", "better on", "worse on", "no evidence on (tasks)",
+          "P(better) over the tasks [95%]", "keep rate", "so"]  # fmt: skip
+
+
+def claims_rows(results: Mapping[str, Any]) -> list[list[str]]:
+    """What the results of a study (format 1) say of each claim, as rows under `HEADER`.
+
+    A pair of arms is judged on the tasks where no seed of either is still to be trained.
+    """
+    rows = []
+    studied = len({cell["task"] for cell in results["cells"]})
+    for claim in CLAIMS:
+        for label, baseline in claim.pairs:
+            cells = list(_ended(results, label, baseline))
+            pairs = {own["task"]: (_scores(own, claim.score), _scores(base, claim.score))
+                     for own, base in cells}  # fmt: skip
+            keep_rates = [float(_scores(own, "keep_rate").mean()) for own, _ in cells]
+            if pairs:
+                row = [claim.text, label, baseline, *_judged(pairs, keep_rates)]
+                if len(pairs) < studied:
+                    row[-1] += f" ({len(pairs)} of {studied} tasks so far)"
+                rows.append(row)
+    return rows
+
+
+def _ended(
+    results: Mapping[str, Any], label: str, baseline: str
+) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """The cells of both arms on each task where every seed is complete or failed."""
+    cells = {(cell["task"], cell["label"]): cell for cell in results["cells"]}
+    seeds = max(len(cell["members"]) for cell in cells.values())
+    for task in dict.fromkeys(task for task, _ in cells):
+        pair = [cells.get((task, name), {"members": []}) for name in (label, baseline)]
+        if all(len(cell["members"]) == seeds for cell in pair):
+            yield pair[0], pair[1]
+
+
+def _scores(cell: Mapping[str, Any], name: str) -> np.ndarray:
+    found = [m[name] for m in cell["members"] if m["status"] == "complete"]
+    return np.array([x for x in found if x is not None], float)
+
+
+def _judged(
+    pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], keep_rates: list[float]
+) -> list[str]:
+    found = compare(pairs)
+    better, worse = (
+        [task.rpartition("-v")[0] or task for task, c in found.items() if c.kind == kind]
+        for kind in ("better", "worse")
+    )
+    rest = len(pairs) - len(better) - len(worse)
+    over = improvement_over_tasks(list(pairs.values()))
+    so = _conclusion(better, worse, rest)
+    if len(pairs) > 1:
+        so += _over(over)
+    if UNFILTERED <= min(keep_rates) < 1:
+        so += "; it drops next to nothing"
+    low, high = f"{min(keep_rates):.3f}", f"{max(keep_rates):.3f}"
+    kept = low if low == high else f"{low} to {high}"
+    return [", ".join(better) or "-", ", ".join(worse) or "-", str(rest), _shown(over), kept, so]
+
+
+def _conclusion(better: list[str], worse: list[str], rest: int) -> str:
+    if worse:
+        return "holds on some tasks, the contrary on others" if better else "does not hold"
+    if rest == 0:
+        return "holds"
+    return "holds on some tasks, not decided on others" if better else "not decided"
+
+
+def _over(over: Estimate) -> str:
+    """Said of the tasks together only where the interval leaves out one half."""
+    if over.low is not None and over.low > 0.5:
+        return "; better over the tasks"
+    if over.high is not None and over.high < 0.5:
+        return "; worse over the tasks"
+    return ""
+
+
+def _shown(over: Estimate) -> str:
+    value, low, high = over
+    return f"{value:.2f}" if low is None or high is None else f"{value:.2f} [{low:.2f}, {high:.2f}]"

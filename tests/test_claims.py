@@ -1,0 +1,74 @@
+"""`results/claims.py`: what is said of the paper's claims follows from the members alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from claims import CLAIMS, HEADER, claims_rows
+
+LOW, HIGH = np.arange(6.0), np.arange(6.0) + 10
+TASKS = ("A-v5", "B-v5", "C-v5")
+
+
+def cell(task: str, label: str, scores: np.ndarray, keep_rate: float = 1.0) -> dict[str, Any]:
+    members = [{"status": "complete", "final_return": x, "area": -x, "keep_rate": keep_rate}
+               for x in scores.tolist()]  # fmt: skip
+    return {"task": task, "label": label, "members": members}
+
+
+def study(sauna: tuple[np.ndarray, ...], keep_rate: float = 0.8) -> dict[str, Any]:
+    cells = [cell(task, "ppo", LOW) for task in TASKS]
+    pairs = zip(TASKS, sauna, strict=False)
+    return {"cells": cells + [cell(task, "sauna", x, keep_rate) for task, x in pairs]}
+
+
+def said(results: dict[str, Any], claim: int = 0) -> dict[str, str]:
+    rows = [dict(zip(HEADER, row, strict=True)) for row in claims_rows(results)]
+    (row,) = [row for row in rows if row["claim"] == CLAIMS[claim].text]
+    return row
+
+
+@pytest.mark.parametrize(
+    "sauna, better, worse, so",
+    [
+        ((HIGH, HIGH, HIGH), "A, B, C", "-", "holds; better over the tasks"),
+        ((HIGH, LOW, LOW), "A", "-", "holds on some tasks, not decided on others"),
+        ((LOW, LOW, LOW), "-", "-", "not decided"),
+        ((-HIGH, LOW, LOW), "-", "A", "does not hold"),
+        ((-HIGH, -HIGH, LOW), "-", "A, B", "does not hold; worse over the tasks"),
+        ((-HIGH, HIGH, LOW), "B", "A", "holds on some tasks, the contrary on others"),
+    ],
+)
+def test_a_claim_is_judged_by_every_task(sauna, better, worse, so) -> None:
+    row = said(study(sauna))
+    assert (row["better on"], row["worse on"], row["arm"]) == (better, worse, "sauna")
+    assert row["so"] == so
+
+
+def test_the_tests_of_a_claim_are_one_family() -> None:
+    """Won 31 of 36 pairs: p = 0.041 alone, and 0.123 of three."""
+    won = np.array([2.5, 3.5, 5.5, 6.5, 7.5, 8.5])
+    assert said({"cells": [cell("A-v5", "ppo", LOW), cell("A-v5", "sauna", won)]})["so"] == "holds"
+    assert said(study((won, LOW, LOW)))["better on"] == "-"
+
+
+def test_area_is_judged_by_the_area() -> None:
+    assert said(study((HIGH, HIGH, HIGH)), claim=1)["so"].startswith("does not hold")
+
+
+def test_what_is_not_trained_to_the_end_is_not_judged() -> None:
+    assert said(study((HIGH, HIGH)))["so"] == "holds; better over the tasks (2 of 3 tasks so far)"
+    assert claims_rows(study((HIGH[:5],))) == []
+
+
+def test_no_credit_for_filtering_next_to_nothing() -> None:
+    assert said(study((HIGH,) * 3, 0.995))["so"].endswith("; it drops next to nothing")
+    assert said(study((HIGH,) * 3, 0.995))["keep rate"] == "0.995"
+
+
+def test_failed_seeds_count_as_ended_and_never_as_scores() -> None:
+    results = study((HIGH, HIGH, HIGH))
+    results["cells"][-1]["members"][0] |= {"status": "failed", "final_return": None}
+    assert said(results)["better on"] == "A, B, C"
