@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from claims import CLAIMS, HEADER, claims_rows
+from claims import CLAIMS, HEADER, claims_rows, told
 
 LOW, HIGH = np.arange(6.0), np.arange(6.0) + 10
 TASKS = ("A-v5", "B-v5", "C-v5")
@@ -21,7 +21,8 @@ def cell(task: str, label: str, scores: np.ndarray, keep_rate: float = 1.0) -> d
 def study(sauna: tuple[np.ndarray, ...], keep_rate: float = 0.8) -> dict[str, Any]:
     cells = [cell(task, "ppo", LOW) for task in TASKS]
     pairs = zip(TASKS, sauna, strict=False)
-    return {"cells": cells + [cell(task, "sauna", x, keep_rate) for task, x in pairs]}
+    cells += [cell(task, "sauna", x, keep_rate) for task, x in pairs]
+    return {"settings": {"seeds": 6}, "cells": cells}
 
 
 def said(results: dict[str, Any], claim: int = 0) -> dict[str, str]:
@@ -31,27 +32,28 @@ def said(results: dict[str, Any], claim: int = 0) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    "sauna, better, worse, so",
+    "sauna, so",
     [
-        ((HIGH, HIGH, HIGH), "A, B, C", "-", "holds; better over the tasks"),
-        ((HIGH, LOW, LOW), "A", "-", "holds on some tasks, not decided on others"),
-        ((LOW, LOW, LOW), "-", "-", "not decided"),
-        ((-HIGH, LOW, LOW), "-", "A", "does not hold"),
-        ((-HIGH, -HIGH, LOW), "-", "A, B", "does not hold; worse over the tasks"),
-        ((-HIGH, HIGH, LOW), "B", "A", "holds on some tasks, the contrary on others"),
+        ((HIGH, HIGH, HIGH), "holds; better over the tasks"),
+        ((HIGH, LOW, LOW), "better on A, not decided on the other 2"),
+        ((LOW, LOW, LOW), "not decided"),
+        ((-HIGH, LOW, LOW), "does not hold: worse on A"),
+        ((-HIGH, -HIGH, LOW), "does not hold: worse on A, B; worse over the tasks"),
+        ((-HIGH, HIGH, LOW), "does not hold: worse on A, better on B"),
     ],
 )
-def test_a_claim_is_judged_by_every_task(sauna, better, worse, so) -> None:
+def test_a_claim_is_judged_by_every_task(sauna, so) -> None:
     row = said(study(sauna))
-    assert (row["better on"], row["worse on"], row["arm"]) == (better, worse, "sauna")
-    assert row["so"] == so
+    assert (row["arm"], row["against"], row["tasks"], row["so"]) == ("sauna", "ppo", "3", so)
 
 
 def test_the_tests_of_a_claim_are_one_family() -> None:
     """Won 31 of 36 pairs: p = 0.041 alone, and 0.123 of three."""
     won = np.array([2.5, 3.5, 5.5, 6.5, 7.5, 8.5])
-    assert said({"cells": [cell("A-v5", "ppo", LOW), cell("A-v5", "sauna", won)]})["so"] == "holds"
-    assert said(study((won, LOW, LOW)))["better on"] == "-"
+    alone = study((won,))
+    alone["cells"] = [cell for cell in alone["cells"] if cell["task"] == TASKS[0]]
+    assert said(alone)["so"] == "holds"
+    assert said(study((won, LOW, LOW)))["so"] == "not decided"
 
 
 def test_area_is_judged_by_the_area() -> None:
@@ -71,4 +73,12 @@ def test_no_credit_for_filtering_next_to_nothing() -> None:
 def test_failed_seeds_count_as_ended_and_never_as_scores() -> None:
     results = study((HIGH, HIGH, HIGH))
     results["cells"][-1]["members"][0] |= {"status": "failed", "final_return": None}
-    assert said(results)["better on"] == "A, B, C"
+    assert said(results)["so"] == "holds; better over the tasks"
+
+
+def test_a_sentence_for_each_claim() -> None:
+    rows = [["A", "x", "-", "holds"], ["A", "y", "-", "not decided"], ["A", "z", "-", "holds"]]
+    assert told([*rows, ["B", "x", "-", "holds"]]) == [
+        "**A.** `x`, `z`: holds. `y`: not decided.",
+        "**B.** `x`: holds.",
+    ]
