@@ -154,6 +154,22 @@ def test_the_verdict_is_first_and_whole(report) -> None:
     places = [page.text.index(verdict["text"]) for verdict in summary["verdicts"]]
     assert places == sorted(places) and len(places) == 6
     assert places[-1] < page.text.index("Final return, IQM")
+    chances = {(row["label"], row["task"]): row["improvement"] for row in summary["table"]}
+    for label in ("vex-head", "sauna", "sauna 0.8"):
+        of_tasks = [chances[label, task][:1] for task in ("HalfCheetah-v5", "Reacher-v5")]
+        assert page.exact(f"{label} than ppo") == [of_tasks]
+
+
+def test_what_an_arm_is_better_than_is_said(tmp_path) -> None:
+    results = make_results()
+    for cell in results["cells"]:
+        if cell["label"] == "sauna 0.8":
+            cell["baseline"] = "vex-head"
+    page, _ = written(results, tmp_path)
+    rows = [row for row in page.rows if row[0] == "sauna 0.8"]
+    assert all(row[2].endswith(" than vex-head") for row in rows[:3])  # two tasks, and over both
+    assert not any(" than " in cell for row in page.rows if row[0] == "sauna" for cell in row)
+    assert len(page.exact("sauna 0.8 than vex-head")) == 1
 
 
 def test_what_is_not_known_is_a_dash(tmp_path) -> None:
@@ -323,7 +339,8 @@ def test_values_follow_keyboard_and_pointer(browser, report) -> None:
     said = "document.querySelector('#learning_curves input').getAttribute('aria-valuetext')"
     assert "90k env steps: ppo " in browser.run(said)
     place = "(r => [r.x + r.width / 2, r.y + r.height / 2])(document.querySelectorAll('.plot svg')"
-    middle = browser.run(f"scrollTo(0, 1200), {place}[1].getBoundingClientRect())")
+    browser.run("document.querySelectorAll('.plot svg')[1].scrollIntoView({block: 'center'})")
+    middle = browser.run(f"{place}[1].getBoundingClientRect())")
     browser.send("Input.dispatchMouseEvent", type="mouseMoved", x=middle[0], y=middle[1])
     second = browser.run("document.querySelectorAll('#learning_curves .readout')[1].innerText")
     assert re.match(r"At [45]\d?k env steps", second)

@@ -68,7 +68,7 @@ def make_page(
         extra=f'<section id="measured"><h2>{extra.title}</h2>{extra.html}</section>'
         if extra.title
         else "",
-        verdicts=verdicts(summary["verdicts"]),
+        verdicts=verdicts(summary),
         table=tables.main_table(results, summary),
         over_tasks=tables.over_tasks(results, summary),
         metric=escape(results["metric"]),
@@ -103,22 +103,65 @@ def _plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
-def verdicts(found: Sequence[Mapping[str, Any]]) -> str:
-    """Each verdict, its kind in words and shape; of many, what they rest on is folded away."""
+def verdicts(summary: Mapping[str, Any]) -> str:
+    """Each verdict, its kind in words and shape; many as a table of arms by tasks, what they rest
+    on folded away."""
+    found = summary["verdicts"]
     if not found:
         return "<p>Nothing is compared: there is no arm beside the baseline.</p>"
-    many = len(found) > UNFOLDED
+    if len(found) <= UNFOLDED:
+        return _sentences(found)
+    folds = ""
+    for task in dict.fromkeys(verdict["task"] for verdict in found):
+        of_task = [verdict for verdict in found if verdict["task"] == task]
+        name = f"{escape(task)}: {_totals(of_task)}"
+        folds += f"<details><summary>{name}</summary>{_sentences(of_task)}</details>\n"
+    return f"<p>{_plural(len(found), 'comparison')}: {_totals(found)}.</p>{_grid(summary)}{folds}"
+
+
+def _totals(found: Sequence[Mapping[str, Any]]) -> str:
+    counts = Counter(verdict["kind"] for verdict in found)
+    return ", ".join(f"{count} {escape(kind)}" for kind, count in counts.items())
+
+
+def _sentences(found: Sequence[Mapping[str, Any]]) -> str:
     items = "".join(
-        f'<li class="{escape(v["kind"].replace(" ", "-"))}"><details{"" if many else " open"}>'
-        f'<summary><span class="kind"><span aria-hidden="true">{MARKS.get(v["kind"], "")}</span> '
-        f"{escape(v['kind'])}</span> <b>{escape(v['label'])}</b> on {escape(v['task'])}</summary>"
-        f"<p>{escape(v['text'])}</p></details></li>\n"
+        f'<li class="{_class(v)}"><span class="kind"><span aria-hidden="true">{MARKS[v["kind"]]}'
+        f"</span> {escape(v['kind'])}</span> <b>{escape(v['label'])}</b> on {escape(v['task'])}"
+        f"<p>{escape(v['text'])}</p></li>\n"
         for v in found
     )
-    counts = Counter(v["kind"] for v in found)
-    total = ", ".join(f"{count} {escape(kind)}" for kind, count in counts.items())
-    head = f"<p>{_plural(len(found), 'comparison')}: {total}.</p>" if many else ""
-    return f'{head}<ul class="verdicts">{items}</ul>'
+    return f'<ul class="verdicts">{items}</ul>'
+
+
+def _class(verdict: Mapping[str, Any]) -> str:
+    return str(verdict["kind"]).replace(" ", "-")
+
+
+def _grid(summary: Mapping[str, Any]) -> str:
+    """Arms by tasks: the kind of each verdict and the chance to be better."""
+    found = {(v["label"], v["task"]): v for v in summary["verdicts"]}
+    table = {(row["label"], row["task"]): row for row in summary["table"]}
+    tasks = list(dict.fromkeys(task for _, task in found))
+    rows = []
+    for label in dict.fromkeys(label for label, _ in found):
+        baseline = next(row["baseline"] for (name, _), row in table.items() if name == label)
+        cells = [
+            f'<span class="{_class(verdict)}"><span role="img" aria-label="{verdict["kind"]}">'
+            f"{MARKS[verdict['kind']]}</span> "
+            f"{tables.number(table[label, task]['improvement'][0], 2)}</span>"
+            if (verdict := found.get((label, task)))
+            else ""
+            for task in tasks
+        ]
+        rows.append((f'{escape(label)} <span class="interval">than {escape(baseline)}</span>',
+                     cells))  # fmt: skip
+    marks = ", ".join(f"{mark} {kind}" for kind, mark in MARKS.items())
+    return (
+        tables.table(("Better", *map(escape, tasks)), rows, name="Verdicts by arm and task")
+        + f'<p class="notes">{marks}. The number is the chance that a seed of the arm ends above '
+        "one of the arm it is compared with; 0.5 is no difference.</p>"
+    )
 
 
 def figure(plot: Plot, picture: Path) -> str:

@@ -112,13 +112,21 @@ def main_table(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
             final = with_interval(row["final_iqm"], digits)
             final += _whisker(row, of_task, labels.index(row["label"]))
             cells = (
-                final, with_interval(row["improvement"], 2),
+                final, _improvement(row, results["baseline"]),
                 with_interval(row["area_iqm"], digits),
                 mean_and_std(row["final_mean"], row["final_std"], digits),
                 number(row["keep_rate"], 3), number(row["env_steps"], 0), _seed_counts(row),
             )  # fmt: skip
             rows.append((escape(row["label"]), cells))
     return table(head, rows, name="Results by task and arm")
+
+
+def _improvement(row: Mapping[str, Any], baseline: str) -> str:
+    """The chance to be better; than what, where that is not the study's baseline."""
+    text = with_interval(row["improvement"], 2)
+    if row["baseline"] in (None, baseline):
+        return text
+    return f'{text} <span class="interval">than {escape(row["baseline"])}</span>'
 
 
 def _seed_counts(row: Mapping[str, Any]) -> str:
@@ -151,7 +159,7 @@ def over_tasks(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     if not summary["over_tasks"]:
         return ""
     rows = [
-        (escape(row["label"]), (str(row["tasks"]), with_interval(row["improvement"], 2)))
+        (escape(row["label"]), (str(row["tasks"]), _improvement(row, results["baseline"])))
         for row in summary["over_tasks"]
     ]
     head = ("Arm", "Tasks", f"Better than {escape(results['baseline'])}")
