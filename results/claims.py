@@ -107,9 +107,11 @@ def _judged(
         [task.rpartition("-v")[0] or task for task, c in found.items() if c.kind == kind]
         for kind in ("better", "worse")
     )
-    over = improvement_over_tasks(list(pairs.values()))
+    (over, *others) = (c.improvement for c in found.values())
+    if others:
+        over = improvement_over_tasks(list(pairs.values()))
     so = _conclusion(better, worse, len(pairs))
-    if len(pairs) > 1:
+    if others:
         so += _over(over)
     if UNFILTERED <= min(keep_rates) < 1:
         so += "; it drops next to nothing"
