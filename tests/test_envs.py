@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sauna.envs.contract import HostEnvs, Step, episode_seed
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
+from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker, make_drawn_env
 from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
 from sauna.errors import BadInput
@@ -186,6 +186,18 @@ def test_environments_that_do_not_exist(env: str, message: str) -> None:
 def test_wrong_keywords_are_bad_input() -> None:
     with pytest.raises(BadInput, match="cannot be made"):
         probe("worlds:Scripted", json.loads('{"speed": 3}'))
+
+
+@pytest.mark.parametrize(
+    "env, kwargs, camera",
+    [
+        ("HalfCheetah-v5", {}, 0),  # its model's own camera, which follows it
+        ("HalfCheetah-v5", {"camera_id": -1}, -1),  # the user's choice
+        ("InvertedPendulum-v5", {}, -1),  # has none, and stays where it is
+    ],
+)
+def test_pictures_follow_the_robot(env: str, kwargs: dict, camera: int) -> None:
+    assert make_drawn_env(env, kwargs).unwrapped.mujoco_renderer.camera_id == camera
 
 
 @backends

@@ -14,7 +14,7 @@ import numpy as np
 
 from sauna import rundir
 from sauna.artifact import Artifact, check_spaces, find_member, load_artifact
-from sauna.envs.gymnasium import make_env
+from sauna.envs.gymnasium import make_drawn_env, make_env
 from sauna.errors import BadInput, SaunaError
 
 if TYPE_CHECKING:
@@ -139,8 +139,7 @@ def film(
     choose_renderer()
     frames: list[np.ndarray] = []
     try:
-        world = make_env(env or artifact.config.env, _kwargs(artifact, env),
-                         render_mode="rgb_array")  # fmt: skip
+        world = make_drawn_env(env or artifact.config.env, _kwargs(artifact, env))
         policy = TrainedPolicy(artifact, name, world)
         play(policy, world, deterministic, seed, lambda: frames.append(world.render()))
     except SaunaError:

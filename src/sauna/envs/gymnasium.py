@@ -100,6 +100,22 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
     return made
 
 
+def make_drawn_env(env: str, env_kwargs: dict[str, Any]) -> Any:
+    """As `make_env`, with pictures (`rgb_array`) that follow the robot.
+
+    Where no camera is asked for, Gymnasium 1.4 draws MuJoCo tasks from where they begin, and a
+    robot that runs leaves the picture. Before, and here, the model's own camera `track` is used.
+    """
+    made = make_env(env, env_kwargs, render_mode="rgb_array")
+    renderer = getattr(getattr(made, "unwrapped", None), "mujoco_renderer", None)
+    if renderer is not None and not any("camera" in name for name in env_kwargs):
+        import mujoco
+
+        camera = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+        renderer.camera_id = camera  # -1, a free camera, where the model has none
+    return made
+
+
 class Slot:
     """One environment, its running episode, and the actions taken in it."""
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.envs.contract import episode_seed
-from sauna.envs.gymnasium import make_env
+from sauna.envs.gymnasium import make_drawn_env, make_env
 from sauna.errors import BadInput, SaunaError, one_line
 from sauna.evaluation import choose_renderer, play
 from sauna.trained import TrainedPolicy
@@ -120,7 +120,7 @@ def open_world(
         chosen = dict(os.environ)
         choose_renderer()
         try:
-            world = make_env(env, kwargs, render_mode="rgb_array")
+            world = make_drawn_env(env, kwargs)
             return world, Pictures(world, say)
         except BadInput as error:
             os.environ.clear()

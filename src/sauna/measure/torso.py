@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sauna.artifact import Artifact
-from sauna.envs.gymnasium import make_env
+from sauna.envs.gymnasium import make_drawn_env, make_env
 from sauna.errors import BadInput, one_line
 from sauna.evaluation import choose_renderer, play
 from sauna.trained import TrainedPolicy
@@ -74,7 +74,7 @@ def _draw(artifact: Artifact, name: str, kwargs: dict[str, Any], path: Path) -> 
             pictures[step] = Image.fromarray(env.render()).resize((SIDE, SIDE))
 
     try:
-        env = make_env(artifact.config.env, kwargs, render_mode="rgb_array")
+        env = make_drawn_env(artifact.config.env, kwargs)
         play(TrainedPolicy(artifact, name, env), env, False, SEED, look)
     except BadInput as error:
         return {"stills": [], "not_drawn": str(error)}
