@@ -7,13 +7,14 @@ So it is judged more strictly than the verdicts of one task, which are corrected
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sauna.study.statistics import Estimate, compare, improvement_over_tasks
 from sauna.study.summary import UNFILTERED
+from sauna.study.tables import unversioned
 
 VARIANTS = ("sauna", "sauna 0.8", "sauna-paper")
 REFERENCES = ("sauna-reference", "sauna-reference, kept steps")
@@ -68,6 +69,18 @@ def claims_rows(results: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
+def number(value: float | None, digits: int) -> str:
+    """`-` where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def interval(values: Sequence[float | None] | None, digits: int) -> str:
+    """A value and its interval, of what there is of them."""
+    if values is None or values[0] is None or values[1] is None:
+        return number(values[0] if values else None, digits)
+    return f"{number(values[0], digits)} [{number(values[1], digits)}, {number(values[2], digits)}]"
+
+
 def told(rows: list[list[str]]) -> list[str]:
     """A sentence for each claim, from its rows."""
     sentences = []
@@ -104,7 +117,7 @@ def _judged(
 ) -> list[str]:
     found = compare(pairs)
     better, worse = (
-        [task.rpartition("-v")[0] or task for task, c in found.items() if c.kind == kind]
+        [unversioned(task) for task, c in found.items() if c.kind == kind]
         for kind in ("better", "worse")
     )
     (over, *others) = (c.improvement for c in found.values())
@@ -117,7 +130,7 @@ def _judged(
         so += "; it drops next to nothing"
     low, high = f"{min(keep_rates):.3f}", f"{max(keep_rates):.3f}"
     kept = low if low == high else f"{low} to {high}"
-    return [str(len(pairs)), _shown(over), kept, so]
+    return [str(len(pairs)), interval(over, 2), kept, so]
 
 
 def _conclusion(better: list[str], worse: list[str], tasks: int) -> str:
@@ -138,8 +151,3 @@ def _over(over: Estimate) -> str:
     if over.high is not None and over.high < 0.5:
         return "; worse over the tasks"
     return ""
-
-
-def _shown(over: Estimate) -> str:
-    value, low, high = over
-    return f"{value:.2f}" if low is None or high is None else f"{value:.2f} [{low:.2f}, {high:.2f}]"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from claims import HEADER, claims_rows, told
+from claims import HEADER, claims_rows, interval, number, told
 
 from sauna.study import dial, noise, torso
 from sauna.study.figures import draw_plots, write_figures
@@ -29,7 +29,7 @@ from sauna.study.page import rounded
 from sauna.study.results import gather
 from sauna.study.spec import load_spec
 from sauna.study.summary import summarize
-from sauna.study.tables import PAPER
+from sauna.study.tables import PAPER, unversioned
 from sauna.study.units import units_of
 
 ROOT = Path(__file__).parent.parent
@@ -137,32 +137,20 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
         seeds = f"{row['seeds']} of {wanted[row['task'], row['label']]}"
         failed = f", {row['failed']} failed" if row["failed"] else ""
         digits = 1 if abs(row["final_mean"] or 0) < 1000 else 0
-        std = _number(row["final_std"], digits)
+        std = number(row["final_std"], digits)
         lines.append(
             f"| {row['task']} | {row['label']} | {seeds}{failed} | "
-            f"{_interval(row['final_iqm'], digits)} | "
-            f"{_number(row['final_mean'], digits)} +- {std} | "
-            f"{_number(row['keep_rate'], 3)} | {row['baseline'] or '-'} | "
-            f"{_interval(row['improvement'], 2)} | {_paper(row['task'], row['label'])} |"
+            f"{interval(row['final_iqm'], digits)} | "
+            f"{number(row['final_mean'], digits)} +- {std} | "
+            f"{number(row['keep_rate'], 3)} | {row['baseline'] or '-'} | "
+            f"{interval(row['improvement'], 2)} | {_paper(row['task'], row['label'])} |"
         )
     return "\n".join(lines)
 
 
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _interval(values: list[float | None] | None, digits: int) -> str:
-    if values is None or values[0] is None:
-        return "-"
-    if values[1] is None:
-        return f"{values[0]:.{digits}f}"
-    return f"{values[0]:.{digits}f} [{values[1]:.{digits}f}, {values[2]:.{digits}f}]"
-
-
 def _paper(task: str, label: str) -> str:
     """The paper's Table 1, beside its PPO and beside the variants of its method."""
-    known = PAPER.get(task.rpartition("-v")[0], {})
+    known = PAPER.get(unversioned(task), {})
     column = "PPO" if label.startswith("ppo") else "SAUNA" if label.startswith("sauna") else ""
     return f"{known[column][0]} +- {known[column][1]}" if column in known else "-"
 
@@ -313,7 +301,7 @@ def main() -> None:
         figures(name, results)
     if "fig3" in found:
         insert(ROOT / "README.md", "ppo", ppo_table(found["fig3"]))
-    for name in CLAIMED[:2]:
+    for name in ("fig3", "cheetah30"):
         if results := load(name):
             insert(ROOT / "README.md", f"{name} claims", _listed(told(claims_rows(results))))
     if "pong" in found:

@@ -169,7 +169,7 @@ def over_tasks(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
 def paper(rows: Sequence[Mapping[str, Any]]) -> str:
     """The paper's numbers beside ours, for the tasks that it has; else nothing."""
     ours = {(row["task"], row["label"]): row for row in rows}
-    tasks = [t for t in dict.fromkeys(row["task"] for row in rows) if _unversioned(t) in PAPER]
+    tasks = [t for t in dict.fromkeys(row["task"] for row in rows) if unversioned(t) in PAPER]
     if not tasks:
         return ""
     labels = list(dict.fromkeys(row["label"] for row in rows if row["task"] in tasks))
@@ -178,7 +178,7 @@ def paper(rows: Sequence[Mapping[str, Any]]) -> str:
     )  # fmt: skip
     found = []
     for task in tasks:
-        cells = [_as_printed(*PAPER[_unversioned(task)][arm]) for arm in ("PPO", "SAUNA")]
+        cells = [_as_printed(*PAPER[unversioned(task)][arm]) for arm in ("PPO", "SAUNA")]
         own = [ours.get((task, label)) for label in labels]
         digits = digits_of(row["final_mean"] for row in own if row)
         cells += [
@@ -195,7 +195,8 @@ def _as_printed(mean: float, std: float) -> str:
     return f"{mean:,g}".replace("-", MINUS) + f" &plusmn; {std:g}"
 
 
-def _unversioned(task: str) -> str:
+def unversioned(task: str) -> str:
+    """The task's name without its version."""
     return re.sub(r"-v\d+$", "", task)
 
 
