@@ -26,6 +26,7 @@ from claims import HEADER, claims_rows, interval, number, told
 from sauna.study import dial, noise, torso
 from sauna.study.figures import draw_plots, write_figures
 from sauna.study.page import rounded
+from sauna.study.report import UNFOLDED
 from sauna.study.results import gather
 from sauna.study.spec import load_spec
 from sauna.study.summary import summarize
@@ -178,8 +179,20 @@ def document() -> str:
         summary = summarize(results)
         parts += [f"## {name}", f"`{results['command']}`", arms_table(name, results, summary)]
         parts.append(_missing(name, results))
-        parts.append(_listed(verdict["text"] for verdict in summary["verdicts"]))
+        parts.append(_verdicts(summary["verdicts"]))
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _verdicts(found: list[dict[str, Any]]) -> str:
+    """Each verdict as a sentence; of many, only the decided ones are open."""
+    if len(found) <= UNFOLDED:
+        return _listed(verdict["text"] for verdict in found)
+    decided = [verdict["text"] for verdict in found if verdict["kind"] in ("better", "worse")]
+    others = [verdict["text"] for verdict in found if verdict["text"] not in decided]
+    return (
+        f"Of {len(found)} comparisons, {len(decided)} are decided.\n\n{_listed(decided)}\n\n"
+        f"<details><summary>The other {len(others)}</summary>\n\n{_listed(others)}\n\n</details>"
+    )
 
 
 def _claims() -> list[str]:
