@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from claims import CLAIMS, HEADER, claims_rows, told
 
+from sauna.study.tables import PAPER
+
 LOW, HIGH = np.arange(6.0), np.arange(6.0) + 10
 TASKS = ("A-v5", "B-v5", "C-v5")
 
@@ -34,11 +36,11 @@ def said(results: dict[str, Any], claim: int = 0) -> dict[str, str]:
 @pytest.mark.parametrize(
     "sauna, so",
     [
-        ((HIGH, HIGH, HIGH), "holds; better over the tasks"),
+        ((HIGH, HIGH, HIGH), "better on A, B, C; better over the tasks by the interval"),
         ((HIGH, LOW, LOW), "better on A, not decided on the other 2"),
         ((LOW, LOW, LOW), "not decided"),
         ((-HIGH, LOW, LOW), "does not hold: worse on A"),
-        ((-HIGH, -HIGH, LOW), "does not hold: worse on A, B; worse over the tasks"),
+        ((-HIGH, -HIGH, LOW), "does not hold: worse on A, B; worse over the tasks by the interval"),
         ((-HIGH, HIGH, LOW), "does not hold: worse on A, better on B"),
     ],
 )
@@ -52,7 +54,7 @@ def test_the_tests_of_a_claim_are_one_family() -> None:
     won = np.array([2.5, 3.5, 5.5, 6.5, 7.5, 8.5])
     alone = study((won,))
     alone["cells"] = [cell for cell in alone["cells"] if cell["task"] == TASKS[0]]
-    assert said(alone)["so"] == "holds"
+    assert said(alone)["so"] == "better on A"
     assert said(study((won, LOW, LOW)))["so"] == "not decided"
 
 
@@ -61,19 +63,38 @@ def test_area_is_judged_by_the_area() -> None:
 
 
 def test_what_is_not_trained_to_the_end_is_not_judged() -> None:
-    assert said(study((HIGH, HIGH)))["so"] == "holds; better over the tasks (2 of 3 tasks so far)"
+    so = said(study((HIGH, HIGH)))["so"]
+    assert so == "better on A, B; better over the tasks by the interval (2 of 3 tasks so far)"
     assert claims_rows(study((HIGH[:5],))) == []
 
 
-def test_no_credit_for_filtering_next_to_nothing() -> None:
-    assert said(study((HIGH,) * 3, 0.995))["so"].endswith("; it drops next to nothing")
-    assert said(study((HIGH,) * 3, 0.995))["keep rate"] == "0.995"
+def test_it_holds_on_the_papers_tasks_and_on_no_fewer() -> None:
+    cells = [cell(task, "ppo", LOW) for task in PAPER]
+    cells += [cell(task, "sauna", HIGH, 0.8) for task in PAPER]
+    results = {"settings": {"seeds": 6}, "cells": cells}
+    assert said(results)["so"] == "holds; better over the tasks by the interval"
+
+
+@pytest.mark.parametrize("keep_rate", [0.995, 1.0])
+def test_no_credit_for_filtering_next_to_nothing(keep_rate: float) -> None:
+    row = said(study((HIGH,) * 3, keep_rate))
+    assert row["so"].endswith("; it drops next to nothing")
+    assert row["keep rate"] == f"{keep_rate:.3f}"
+
+
+def test_no_credit_where_it_filtered_nothing_on_the_task_it_won() -> None:
+    results = study((HIGH, LOW, LOW), 0.8)
+    for member in results["cells"][3]["members"]:
+        member["keep_rate"] = 1.0
+    assert said(results)["so"] == (
+        "better on A (where it drops next to nothing), not decided on the other 2"
+    )
 
 
 def test_failed_seeds_count_as_ended_and_never_as_scores() -> None:
     results = study((HIGH, HIGH, HIGH))
     results["cells"][-1]["members"][0] |= {"status": "failed", "final_return": None}
-    assert said(results)["so"] == "holds; better over the tasks"
+    assert said(results)["so"] == "better on A, B, C; better over the tasks by the interval"
 
 
 def test_a_sentence_for_each_claim() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -16,9 +17,10 @@ import pytest
 from helpers import SMALL, environment
 from sauna import rundir
 from sauna.api import compare
+from sauna.config import parse
 from sauna.errors import BadInput
 from sauna.presets import ARMS, COMPARED
-from sauna.study.command import comparison
+from sauna.study.command import compare_command, comparison
 from sauna.study.process import UnitProcess
 from sauna.study.spec import built_in, check, load_spec, read_spec
 from sauna.study.summary import summarize
@@ -51,6 +53,12 @@ QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
         ({"arm": "sauna"}, "unknown key 'arm'"),
         ({"name": "../x"}, "cannot be a folder"),
         ({"name": "units"}, "cannot be a folder"),
+        ({"name": ".."}, "cannot be a folder"),
+        ({"arms": [{"label": "ppo"}, {"label": "sauna", "baseline": "sauna"}]}, "own baseline"),
+        (
+            {"arms": [{"label": "ppo", "tasks": ["B-v0"]}, {"label": "sauna"}]},
+            "'ppo', the baseline of 'sauna', is not trained on A-v0",
+        ),
         ({"arms": [{"label": ["x"]}]}, "arm must be a name"),
         ({"arms": [{"label": "ppo"}, {"label": "random-drop", "rates_of": "ppo"}]}, "not filter"),
         ({"arms": [{"label": "random-drop", "rates_of": 3}]}, "rates_of must be a name"),
@@ -140,7 +148,35 @@ def test_units_share_folders_with_equal_settings_and_follow_their_source() -> No
             assert units[unit.source].label == "sauna 0.8"
         seen.add(name)
     spec = read_spec({**TWO, "seeds": 4})
-    assert [seeds_per_unit(spec, cores) for cores in (1, 2, 4, 64)] == [3, 3, 2, 1]
+    assert [seeds_per_unit(spec, cores) for cores in (1, 4, 5, 64)] == [2, 2, 1, 1]
+    spec = comparison("A-v0", COMPARED, {})  # 18 of its 24 members can start at once
+    sizes = [seeds_per_unit(spec, cores) for cores in (2, 6, 7, 9, 10, 64)]
+    assert sizes == [3, 3, 2, 2, 1, 1]
+
+
+@pytest.mark.parametrize(
+    "settings", [{"seeds": 6}, {"steps": 1e6}, {"steps": 1_000_000, "seeds": [0, 1, 2, 3, 4, 5]}]
+)
+def test_however_its_settings_are_written_a_comparison_is_the_same(settings: dict) -> None:
+    plain, other = comparison("A-v0", COMPARED, {}), comparison("A-v0", COMPARED, settings)
+    assert plain.name == other.name
+    assert {u.name for u in units_of(plain, SEEDS)} == {u.name for u in units_of(other, SEEDS)}
+    changed = comparison("A-v0", COMPARED, {"steps": 999_999})
+    assert changed.name != plain.name
+    assert not {u.name for u in units_of(changed, SEEDS)} & {u.name for u in units_of(plain, SEEDS)}
+
+
+def test_its_units_are_those_of_a_study_with_the_same_settings() -> None:
+    ours = comparison("Hopper-v5", ("ppo", "sauna"), {"threshold": 0.8})
+    fig3 = {u.name for u in units_of(load_spec("fig3"), SEEDS)}
+    assert {u.name for u in units_of(ours, SEEDS)} < fig3
+
+
+def test_a_coin_shares_the_rules_of_the_arm_whose_rates_it_repeats() -> None:
+    spec = comparison("A-v0", ("ppo", "random-drop", "sauna-reference"), {})
+    coin, source = (check(spec.arms[i], "A-v0") for i in (1, 2))
+    for name in ("gae_over", "max_env_steps_factor", "vex_target", "truncation", "budget"):
+        assert getattr(coin, name) == getattr(source, name)
 
 
 def rows_of(out: Path) -> dict[str, bytes]:
@@ -219,6 +255,29 @@ def test_python_finds_what_the_command_made(compared: Path) -> None:
         compare(lambda: None, out=compared)
 
 
+def test_in_python_quiet_is_quiet_also_from_a_thread(compared: Path, capfd) -> None:
+    found: list[Any] = []
+    settings = {"seeds": 4, "out": compared, "processes": 2, "quiet": True, **QUICK}
+    thread = threading.Thread(target=lambda: found.append(compare("worlds:Scripted", **settings)))
+    thread.start()
+    thread.join()
+    assert found[0]["table"] and capfd.readouterr().out == ""
+    with pytest.raises(BadInput, match="processes: must be"):
+        compare("worlds:Scripted", out=compared / "none", processes=-1)
+    assert not (compared / "none").exists()
+
+
+def test_the_command_that_repeats_a_comparison() -> None:
+    settings = {"seeds": [3], "env_kwargs": {"a": "b c"}, "hidden": [8]}
+    command = compare_command("A-v0", ("ppo", "sauna"), settings, "my runs")
+    typed = shlex.split(command)
+    assert typed[:5] == ["sauna", "compare", "A-v0", "--arms", "ppo,sauna"]
+    flags = dict(zip(typed[5::2], typed[6::2], strict=True))
+    assert parse("seeds", flags["--seeds"]) == (3,)
+    assert parse("hidden", flags["--hidden"]) == (8,)
+    assert json.loads(flags["--env-kwargs"]) == {"a": "b c"} and flags["--out"] == "my runs"
+
+
 @pytest.mark.slow
 def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp_path) -> None:
     """SIGKILL leaves no orphan behind; SIGTERM saves and exits 143."""
@@ -291,6 +350,7 @@ def test_a_second_study_in_the_same_place_is_refused(tmp_path: Path) -> None:
     with rundir.lock(tmp_path / "units"):
         done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
     assert done.returncode == 2 and "is in use by process" in done.stderr
+    assert {path.name for path in tmp_path.rglob("*")} == {"units", ".lock"}
 
 
 def test_lines_that_are_no_messages_are_passed_over(tmp_path: Path, monkeypatch) -> None:

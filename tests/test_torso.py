@@ -43,7 +43,7 @@ def test_the_pitch_is_the_torsos_in_the_world() -> None:
 def test_its_runs_are_those_of_the_thirty_seeds() -> None:
     ours, theirs = load_spec("fig5"), load_spec("cheetah30")
     assert len(ours.arms) == 2 and all(len(arm.seeds) >= 20 for arm in ours.arms)
-    for cores in (1, 2, 8, 16, 29):
+    for cores in (1, 2, 8, 16, 20):
         sizes = [seeds_per_unit(spec, cores) for spec in (ours, theirs)]
         names = [{unit.name for unit in units_of(spec, size)}
                  for spec, size in zip((ours, theirs), sizes, strict=True)]  # fmt: skip

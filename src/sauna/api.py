@@ -106,9 +106,8 @@ def compare(
                 raise BadInput(f"{name}: other processes cannot import it; put it into a module")
     task = given.pop("env")
     spec = comparison(task, tuple(arms), parse_all(given))
-    command = compare_command(task, tuple(arms), given)
-    say = _Silent().say if quiet else make_display().say
-    return study(spec, Path(out), command, processes, say)
+    command = compare_command(task, tuple(arms), given, out)
+    return study(spec, Path(out), command, processes, quiet=quiet)
 
 
 def resume(

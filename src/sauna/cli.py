@@ -261,26 +261,29 @@ def _compare(values: dict[str, Any]) -> None:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
     spec = comparison(env, arms, parse_all(values))
-    _run_study(spec, compare_command(env, arms, values), **place)
+    _run_study(spec, compare_command(env, arms, values, place["out"]), **place)
 
 
 def _study(values: dict[str, Any]) -> None:
-    from sauna.study.spec import load_spec
+    from sauna.study.command import load_spec, study_command
 
     name = values.pop("study")
-    _run_study(load_spec(name), f"sauna study {name}", **values)
+    _run_study(load_spec(name), study_command(name, values["out"]), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
     from sauna.study.command import lines, study
 
     jobs = _whole({"processes": processes}, "processes", 0)
-    command += f" --out {out}" if out != "runs" else ""
-    summary = study(spec, Path(out), command, jobs, _say, on, address)
+    summary = study(spec, Path(out), command, jobs, on, address)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
     if not any(row["seeds"] for row in summary["table"]):
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
+    if number := summary.get("not_measured"):
+        log = Path(out) / spec.name / spec.measure / "stderr.txt"
+        raise SaunaError(f"{number} members could not be measured; {log} says why, and running "
+                         f"again tries them again")  # fmt: skip
 
 
 def _bench(values: dict[str, Any]) -> None:

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import json
 import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -26,6 +24,7 @@ from sauna.errors import Interrupted, SaunaError
 from sauna.metrics.curve import draw_curve
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
+from sauna.signals import handled
 from sauna.watch import Watch
 from sauna.wire import Message, Worker, receive, start_thread, start_worker
 from sauna.worker import serve, write_job
@@ -108,7 +107,7 @@ class Coordinator:
     def run(self) -> None:
         run = self._run
         self._display.open(run.config, run.members, run.path, rundir.rows(run.path))
-        with _signals(self._on_signal):
+        with handled(self._on_signal):
             self._grant()
             while any(end is None for end in self._ended):
                 self._pump()
@@ -299,18 +298,3 @@ def _environment(config: Config) -> dict[str, str]:
 def _append(path: Path, rows: list[dict[str, Any]]) -> None:
     with path.open("a") as file:
         file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
-
-
-@contextmanager
-def _signals(handle: Callable[[int], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM go to `handle`; in another thread than the main one nothing changes."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda n, frame: handle(n)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)

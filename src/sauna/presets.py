@@ -122,9 +122,9 @@ FIXED: dict[str, tuple[str, ...]] = {
     "random-drop": ("filter",),
 }
 
-# Rules of the experiment rather than of the filter: an unfiltered arm beside a filtered one takes
-# them over, so that only the filter differs.
-_SHARED_RULES = ("vex_target", "filter", "threshold_schedule", "keep_rate_target", "history",
+# Rules of the experiment rather than of the filter: an unfiltered arm that shares a filtered one's
+# program takes them over, and so does a coin that repeats its drop rates: only the filter differs.
+SHARED_RULES = ("vex_target", "filter", "threshold_schedule", "keep_rate_target", "history",
                  "decision", "dropped", "max_env_steps_factor", "gae_over", "truncation",
                  "budget")  # fmt: skip
 
@@ -226,7 +226,7 @@ def _member_config(arm: str, parsed: Mapping[str, Any], shared: Config) -> Confi
     """An arm's own traced values on the shared program; filter off is threshold 0."""
     own = arm_config(arm, parsed)
     off = own.filter == "none" and shared.filter != "none"
-    rules = {name: getattr(shared, name) for name in _SHARED_RULES}
+    rules = {name: getattr(shared, name) for name in SHARED_RULES}
     return dataclasses.replace(own, **rules, threshold=0.0 if off else own.threshold)
 
 

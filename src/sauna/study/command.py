@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
+import shlex
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sauna import rundir
+from sauna.config import Config
 from sauna.envs.probe import Probe
 from sauna.errors import BadInput, Interrupted
 from sauna.placement import look_at, placed
 from sauna.presets import algorithm_of, chosen_preset
 from sauna.run import check_read_after_settling, settle
+from sauna.signals import handled
+from sauna.spaces import Spaces
 from sauna.study.local import LocalExecutor
-from sauna.study.measuring import gather_measured, measure
+from sauna.study.measuring import gather_measured, items_of, measure
+from sauna.study.numbers import digits_of, interval, number
 from sauna.study.results import gather, typed
 from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
 from sauna.study.summary import summarize
-from sauna.study.units import Unit, most_seeds, seeds_per_unit, units_of
+from sauna.study.units import (
+    Unit,
+    digest_of,
+    most_seeds,
+    seeds_per_unit,
+    study_identity,
+    units_of,
+)
 from sauna.study.view import StudyView
 
 SEEDS = 6  # of a comparison, where none are given
@@ -42,17 +54,27 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
     entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
     values = {"tasks": [env], "arms": entries, "seeds": SEEDS, **rules, **settings}
-    text = json.dumps(values, sort_keys=True, default=list)
+    spec = read_spec({"name": "compare", **values})
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
-    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    name, baseline = f"compare_{place}_{digest}", entries[0]["label"] if entries else ""
-    return read_spec({"name": name, "baseline": baseline, **values})
+    name = f"compare_{place}_{digest_of(study_identity(spec))}"
+    return spec._replace(name=name, text={**spec.text, "name": name})
 
 
-def compare_command(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> str:
+def compare_command(
+    env: str, arms: tuple[str, ...], settings: Mapping[str, Any], out: str | Path
+) -> str:
     """What a user types to make the same comparison again."""
     flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
-    return f"sauna compare {env} --arms {','.join(arms)}{flags}"
+    return f"sauna compare {shlex.quote(env)} --arms {','.join(arms)}{flags}{_typed_out(out)}"
+
+
+def study_command(name: str, out: str | Path) -> str:
+    """What a user types to run the study again."""
+    return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
+
+
+def _typed_out(out: str | Path) -> str:
+    return f" {typed('out', out)}" if str(out) != "runs" else ""
 
 
 def study(
@@ -60,9 +82,9 @@ def study(
     out: Path,
     command: str,
     jobs: int,
-    say: Callable[[str], None],
     on: str = "local",
     address: str = "",
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
@@ -73,9 +95,9 @@ def study(
       out: the folder.
       command: that ran it, for the report.
       jobs: trainings at a time; 0: one per core.
-      say: prints a line.
       on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
       address: of the cluster.
+      quiet: show nothing.
 
     Returns:
       the summary.
@@ -84,6 +106,8 @@ def study(
       BadInput: an environment, or the cluster, cannot be used.
       Interrupted: a signal came; running again continues.
     """
+    if jobs < 0:
+        raise BadInput("processes: must be a whole number of at least 0")
     if on == "ray":
         from sauna.study import cluster
 
@@ -93,10 +117,10 @@ def study(
     _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
-        return _train(LocalExecutor, spec, out, command, jobs, say, command)
+        return _train(LocalExecutor, spec, out, command, jobs, command, quiet)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with cluster.connected(address, jobs) as jobs:
-        return _train(cluster.RayExecutor, spec, out, command, jobs, say, again)
+        return _train(cluster.RayExecutor, spec, out, command, jobs, again, quiet)
 
 
 def _check_runs(spec: Spec) -> None:
@@ -118,8 +142,19 @@ def _check_runs(spec: Spec) -> None:
                 settled = settle(config, found[key].spaces)
                 given = {**arm.given(task, arm.seeds), "drop_rate_from": settled.drop_rate_from}
                 check_read_after_settling(found[key].spaces, settled, given)
+                _check_measurable(spec, settled, found[key].spaces)
             except BadInput as error:
                 raise BadInput(f"arm {arm.label!r}: {error}") from None
+
+
+def _check_measurable(spec: Spec, config: Config, spaces: Spaces) -> None:
+    """Refuses what only an environment's spaces tell of a measurement."""
+    if spec.measure == "dial" and not config.normalize_observations:
+        raise BadInput("measure: dial takes its scale from the normaliser of observations, which "
+                       f"{config.env} does not have")  # fmt: skip
+    if spec.measure == "noise" and spaces.observation_kind == "image":
+        raise BadInput("measure: noise keeps rollouts of observations in memory, which pictures "
+                       "are too large for")  # fmt: skip
 
 
 def _on_gpu(spec: Spec) -> bool:
@@ -134,27 +169,30 @@ def _train(
     out: Path,
     command: str,
     jobs: int,
-    say: Callable[[str], None],
     again: str,
+    quiet: bool,
 ) -> dict[str, Any]:
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
-    units = units_of(spec, _unit_size(spec, place, jobs))
-    folder.mkdir(exist_ok=True)
-    held = rundir.lock(folder)
-    view = StudyView(spec, units, folder)
-    say(f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, "
-        f"{sum(len(unit.seeds) for unit in units)} members; writing to {place}")  # fmt: skip
-    with _signals() as noted:
-        view.open()
-        try:
-            executor(folder, jobs, view, lambda: bool(noted)).run(units)
-            view.close()
-            if spec.measure:
-                measure(spec, units, folder, place, min(jobs, cores()), say, lambda: bool(noted))
-        finally:
-            view.close()
-            held.close()
+    size = _unit_size(spec, place, jobs)
+    with _held(folder):
+        _note(spec, place, size)
+        units = units_of(spec, size)
+        view = StudyView(spec, units, folder, quiet)
+        members = sum(len(unit.seeds) for unit in units)
+        view.say(f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
+                 f"writing to {place}")  # fmt: skip
+        noted: list[int] = []
+        with handled(partial(_note_signal, noted)):
+            view.open()
+            try:
+                executor(folder, jobs, view, lambda: bool(noted)).run(units)
+                view.close()
+                if spec.measure:
+                    measure(spec, units, folder, place, min(jobs, cores()), view.say,
+                            lambda: bool(noted))  # fmt: skip
+            finally:
+                view.close()
     summary = write(spec, units, folder, place, command)
     if noted:
         name = signal.Signals(noted[0]).name
@@ -162,25 +200,54 @@ def _train(
     return summary
 
 
+def _note_signal(noted: list[int], number: int) -> None:
+    """The first signal lets the units save; the second one stops at once."""
+    if noted:
+        raise Interrupted(number, "stopped at once; running again continues")
+    noted.append(number)
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """The folder of units, made and held: one study at a time."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"out: cannot make {folder}: {error.strerror}") from error
+    with rundir.lock(folder):
+        yield
+
+
 def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
     """Seeds per unit: as when the study began, so that its units are found again.
 
     Raises:
-      BadInput: the folder holds another study of this name, or cannot be made.
+      BadInput: the folder holds another study of this name.
     """
     path = place / "study.json"
     if path.is_file():
         stored = json.loads(path.read_text())
-        if stored["study"] != spec.text:
+        if not _is_same(stored["study"], spec):
             raise BadInput(f"study: {place} holds another study of this name; give --out")
         return int(stored["seeds_per_unit"])
-    size = most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
+    return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
+
+
+def _note(spec: Spec, place: Path, size: int) -> None:
+    """Makes the study's folder and notes what the study is."""
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
-    rundir.write_json(path, {"study": spec.text, "seeds_per_unit": size})
-    return size
+    rundir.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+
+
+def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:
+    """Whether a study reads as `spec`, however its values are written."""
+    try:
+        return study_identity(read_spec(text)) == study_identity(spec)
+    except BadInput:
+        return False
 
 
 def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
@@ -197,30 +264,14 @@ def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str
         rundir.write_json(place / f"{spec.measure}.json", measured)
         study = {"noise": noise, "dial": dial, "torso": torso}[spec.measure]
         summary["measured"] = study.verdicts(measured)
+        summary["not_measured"] = sum(
+            not item.is_done for item in items_of(spec, units, folder, place)
+        )
         extra = torso.extra(measured, place) if study is torso else study.extra(measured)
     rundir.write_json(place / "results.json", results)
     rundir.write_json(place / "summary.json", summary)
     write_report(results, summary, place, extra)
     return summary
-
-
-@contextmanager
-def _signals() -> Iterator[list[int]]:
-    """The signals that asked to stop; the second one stops at once."""
-    noted: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        if noted:
-            raise Interrupted(number, "stopped at once; running again continues")
-        noted.append(number)
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, note) for number in numbers]
-    try:
-        yield noted
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
@@ -236,23 +287,13 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
 
 def _row(row: Mapping[str, Any]) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
-    mean, std = _number(row["final_mean"]), _number(row["final_std"])
+    digits = digits_of([row["final_mean"]])
+    mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
     return [
-        row["task"], row["label"], f"{row['seeds']}{failed}", _interval(row["final_iqm"]),
-        _interval(row["area_iqm"]), f"{mean} +- {std}", _number(row["keep_rate"], 3),
-        _number(row["env_steps"], 0), _interval(row["improvement"], 2),
+        row["task"], row["label"], f"{row['seeds']}{failed}", interval(row["final_iqm"], digits),
+        interval(row["area_iqm"], digits), f"{mean} +- {std}", number(row["keep_rate"], 3),
+        number(row["env_steps"], 0), interval(row["improvement"], 2),
     ]  # fmt: skip
-
-
-def _number(value: float | None, digits: int = 1) -> str:
-    return "-" if value is None else f"{value:,.{digits}f}"
-
-
-def _interval(values: list[float | None] | None, digits: int = 1) -> str:
-    if values is None or values[0] is None:
-        return "-"
-    value, low, high = (_number(v, digits) for v in values)
-    return value if low == "-" else f"{value} [{low}, {high}]"
 
 
 def cores() -> int:

@@ -50,7 +50,7 @@ class Mark(NamedTuple):
 
     kind: str  # of `LOOKS`
     label: str
-    threshold: float  # where it moves, the mean over members of its median over training
+    threshold: float  # of a coin, that of the arm whose rates it repeats
     members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
 
 
@@ -70,7 +70,7 @@ def looks() -> dict[str, style.Look]:
 def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
     """Every arm of a task whose threshold is known, in the order of the study."""
     cells = [cell for cell in measured["cells"] if cell["task"] == task]
-    constant = {cell["label"]: cell["config"]["threshold"] for cell in cells}
+    thresholds = {cell["label"]: _threshold(cell) for cell in cells}
     found = []
     for cell in cells:
         numbers = {
@@ -78,15 +78,20 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
                   if (value := _number(m, key)) is not None]
             for key, *_ in QUANTITIES
         }  # fmt: skip
-        kind, threshold = _kind(cell), cell["config"]["threshold"]
-        if kind in ("scheduled", "held keep rate"):
-            moved = [m["threshold"] for m in cell["members"] if m.get("threshold") is not None]
-            threshold = float(np.mean(moved)) if moved else None
-        elif kind.startswith("coin"):
-            threshold = constant.get(cell["rates_of"])
+        kind = _kind(cell)
+        stands_for = cell["rates_of"] if kind.startswith("coin") else cell["label"]
+        threshold = thresholds.get(stands_for)
         if threshold is not None:
             found.append(Mark(kind, cell["label"], threshold, numbers))
     return found
+
+
+def _threshold(cell: Mapping[str, Any]) -> float | None:
+    """An arm's own: where it moves, the mean over members of its median over training."""
+    if _kind(cell) == "constant":
+        return float(cell["config"]["threshold"])
+    moved = [m["threshold"] for m in cell["members"] if m.get("threshold") is not None]
+    return float(np.mean(moved)) if moved else None
 
 
 def _kind(cell: Mapping[str, Any]) -> str:
@@ -132,12 +137,14 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
 def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | None:
     """Rank correlation with a constant threshold, its p value, and the number of members.
 
-    None where fewer than three thresholds, or equal values, leave nothing to correlate.
+    None where there are fewer than three thresholds. What is the same for all follows nothing.
     """
     pairs = [(m.threshold, value) for m in found if m.kind == "constant"
              for _, value in m.members[key]]  # fmt: skip
-    if len({threshold for threshold, _ in pairs}) < 3 or len({value for _, value in pairs}) < 2:
+    if len({threshold for threshold, _ in pairs}) < 3:
         return None
+    if len({value for _, value in pairs}) < 2:
+        return 0.0, 1.0, len(pairs)
     x, y = (scipy.stats.rankdata(column) for column in zip(*pairs, strict=True))
     x, y = x - x.mean(), y - y.mean()
     rho = float(x @ y / np.sqrt((x @ x) * (y @ y)))

@@ -104,7 +104,8 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
              _curve_panels(results, summary, metric))
         for name, metric, title, caption, y_label, limits in _CURVES
     ]  # fmt: skip
-    caption = "Share of the seeds whose final return is at least x; band: 95% interval."
+    caption = ("Share of the seeds whose final return is at least x; band: 95% interval, which has "
+               "no width where all seeds or none reach x, and is no certainty there.")  # fmt: skip
     plots.append(
         Plot("profiles", "Performance profiles", caption, "final return", "share of seeds",
              (0.0, 1.0), _profile_panels(summary))

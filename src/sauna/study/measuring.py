@@ -82,12 +82,14 @@ def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) 
 
 
 def scale_of(spec: Spec, items: list[Item], task: str) -> dict[str, Any] | None:
-    """Whose normaliser scales the observations of all arms: the baseline's first member at its end.
+    """Whose normaliser scales the observations of all arms: the baseline's first seed at its end.
 
-    None while that is not trained.
+    None while that is not trained. It is never another seed, so that all measurements, early and
+    late ones, have one scale.
     """
+    first = next(arm.seeds[0] for arm in spec.arms if arm.label == spec.baseline)
     for item in items:
-        if (item.task, item.label) == (task, spec.baseline) and item.iterations:
+        if (item.task, item.label, item.seed) == (task, spec.baseline, first) and item.iterations:
             last = max(item.iterations)
             return {"run": str(item.run), "member": f"{item.arm}/{item.seed}", "iteration": last}
     return None
@@ -110,6 +112,9 @@ def measure(
     scales = {}
     if spec.measure == "dial":
         scales = {task: scale_of(spec, items, task) for task in spec.tasks}
+        for task in (task for task, scale in scales.items() if scale is None):
+            say(f"{task} is not measured: the first seed of {spec.baseline}, whose normaliser is "
+                f"the scale of all, is not trained")  # fmt: skip
         items = [item for item in items if scales[item.task]]
     waiting = [item for item in items if not item.is_done]
     if not waiting or stopping():
@@ -134,7 +139,8 @@ def measure(
                     say(f"{_named(item)}: {message['error']}")
                 continue
             how = running.pop(item.files[0]).end()
-            say(f"{_named(item)}: {'measured' if item.is_done else how}")
+            log = place / str(spec.measure) / "stderr.txt"
+            say(f"{_named(item)}: {'measured' if item.is_done else f'{how}; see {log}'}")
     finally:
         for process in running.values():
             process.stop()

@@ -39,12 +39,12 @@ def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[st
         "metric": METRIC,
         "baseline": spec.baseline,
         "settings": top,
-        **_made_with(units, folder),
+        **made_with(units, folder),
         "cells": cells,
     }
 
 
-def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
+def made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
     """Versions and machines of the runs; each difference is listed."""
     found: dict[str, list[Any]] = {"versions": [], "machine": [], "git": []}
     for unit in units:
@@ -58,12 +58,13 @@ def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
 
 
 def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any]:
-    members = [member for unit in units for member in _members(unit, folder)]
     config = to_json(check(arm, task))
-    flags = {**arm.settings, "arm": arm.arm, "seeds": ",".join(map(str, arm.seeds)) + ","}
-    if arm.rates_of is not None:
-        config["drop_rate_from"] = flags["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
+    members = [m for unit in units for m in _members(unit, folder, config["steps"])]
+    flags = {**arm.settings, "arm": arm.arm, "seeds": arm.seeds}
     text = " ".join(typed(key, value) for key, value in flags.items())
+    if arm.rates_of is not None:
+        config["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
+        text += f" --drop-rate-from RUN  # of {arm.rates_of!r}, the same seeds"
     return {
         "task": task,
         "label": arm.label,
@@ -71,22 +72,23 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
         "baseline": arm.baseline,
         "preset": config["preset"],
         "config": config,
-        "command": f"sauna train {task} {text}",
+        "command": f"sauna train {shlex.quote(task)} {text}",
+        "git": made_with(units, folder)["git"],
         "members": sorted(members, key=lambda member: arm.seeds.index(member["seed"])),
     }
 
 
 def typed(name: str, value: Any) -> str:
-    """A setting as it is typed."""
+    """A setting as it is typed; one seed ends in a comma, without which it would be a count."""
     if isinstance(value, bool):
         return flag(name) if value else flag("no_" + name)
     if isinstance(value, list | tuple):
-        value = ",".join(map(str, value))
+        value = ",".join(map(str, value)) + "," * (name == "seeds" and len(value) == 1)
     text = json.dumps(value) if isinstance(value, dict) else str(value)
     return f"{flag(name)} {shlex.quote(text)}"
 
 
-def _members(unit: Unit, folder: Path) -> list[dict[str, Any]]:
+def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
     found = []
     for part in parts(unit, folder):
         rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in part.seeds}
@@ -99,19 +101,26 @@ def _members(unit: Unit, folder: Path) -> list[dict[str, Any]]:
                 status = "complete"
             elif error is not None:
                 status = "failed"
-            found.append({"seed": seed, "status": status, "error": error, **_ended(rows[seed])})
+            found.append(
+                {"seed": seed, "status": status, "error": error, **_ended(rows[seed], budget)}
+            )
     return found
 
 
-def _ended(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """A member's last numbers and its thinned curve."""
+def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
+    """A member's last numbers and its thinned curve.
+
+    The area is that of the first `budget` env steps, also where kept steps are counted and a member
+    takes more env steps.
+    """
     last = rows[-1] if rows else {}
     steps = np.array([row["env_steps"] for row in rows], float)
     returns = np.array([row.get("return_mean", np.nan) for row in rows], float)
+    within = steps <= budget
     kept, tried = last.get("kept_steps"), last.get("env_steps")
     return {
         "final_return": last.get("return_mean"),
-        "area": area_under_curve(steps, returns) if rows else None,
+        "area": area_under_curve(steps[within], returns[within]),
         "env_steps": tried,
         "kept_steps": kept,
         "keep_rate": kept / tried if kept is not None and tried else None,

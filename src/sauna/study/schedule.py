@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from sauna import rundir
 from sauna.study.units import Unit, mark_split, needs_split, parts, split
 
-ATTEMPTS = 2  # a failed unit is tried once more
+ATTEMPTS = 2  # a failed unit is continued once
 
 
 class View(Protocol):
@@ -24,8 +24,9 @@ class View(Protocol):
 class Executor(ABC):
     """Runs units, `jobs` at a time; a subclass says where.
 
-    A unit that fails is tried once more, then split into its seeds, and a seed that fails for good
-    is noted in its `failed.json`.
+    A unit that fails is continued once. If it fails again it is split into its seeds, each of which
+    is trained once, as nobody can tell which of them broke it; a seed alone that fails for good is
+    noted in its `failed.json`.
 
     Args:
       folder: where the units' folders are.
@@ -115,6 +116,9 @@ class Executor(ABC):
                 self._waiting.insert(0, unit)
             elif len(unit.seeds) > 1:
                 self._split(unit)
+                self._attempts |= dict.fromkeys(
+                    (single.name for single in split(unit, self._folder)), ATTEMPTS - 1
+                )
             else:
                 self._give_up(unit, error)
 

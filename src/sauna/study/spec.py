@@ -31,9 +31,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna.config import FIELDS, Config, check_read, parse
+from sauna.config import FIELDS, Config, check_read, parse, to_json
 from sauna.errors import BadInput, nearest
-from sauna.presets import ARMS, DECIDED, FIXED, arm_config, parse_all, resolve
+from sauna.presets import ARMS, DECIDED, FIXED, SHARED_RULES, arm_config, parse_all, resolve
 
 _OWN = (*DECIDED, "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
@@ -85,7 +85,7 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
     common = {key: value for key, value in values.items() if key not in _TOP}
     parse_all(common)
     name = _text(values.get("name", "study"), "name")
-    if name in ("units", "") or not set(name) <= _NAME:
+    if name in ("units", "") or not set(name) <= _NAME or not name.strip("."):
         raise BadInput(f"study: name {name!r} cannot be a folder of its own under --out")
     entries = values.get("arms") or []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
@@ -159,10 +159,15 @@ def _check_measure(measure: Any, configs: list[Config]) -> None:
         rollout = config.rollout_steps * config.envs
         kept = config.keep_checkpoints * config.checkpoint_every * rollout
         if measure != "torso" and kept < config.steps:
+            every = min(config.checkpoint_every, -(-config.steps // (100 * rollout)))
             raise BadInput("keep_checkpoints: measure needs the checkpoints along training; set "
-                           "checkpoint_every = 10 and keep_checkpoints = 1000")  # fmt: skip
+                           f"checkpoint_every = {every} and keep_checkpoints = "
+                           f"{-(-config.steps // (every * rollout))}")  # fmt: skip
         if config.backend == "device":
             raise BadInput("backend: measure needs environments on the host")
+        if measure == "dial" and config.filter not in ("sauna", "random-drop"):
+            raise BadInput('study: measure = "dial" is of arms that have a threshold, and coins '
+                           f"beside them, not of {', '.join(config.arm)}")  # fmt: skip
         if measure == "torso" and not config.env.startswith("HalfCheetah"):
             raise BadInput(f'study: measure = "torso" is of HalfCheetah, not of {config.env}')
         if measure == "dial" and not config.normalize_observations:
@@ -193,16 +198,32 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
         source = filtered[0]
     if source is not None and arm.arm != "random-drop":
         raise BadInput(f"study: rates_of is read by random-drop only, not by {arm.label!r}")
-    for name in (arm.baseline, source, baseline):
+    own = arm.baseline or (None if arm.label == baseline else baseline)
+    for name in (own, source, baseline):
         if name is not None and name not in known:
             raise BadInput(f"study: there is no arm {name!r}{nearest(name, known)}")
+    if own == arm.label:
+        raise BadInput(f"study: {own!r} cannot be its own baseline")
+    if own is not None and (missing := set(arm.tasks) - set(known[own].tasks)):
+        raise BadInput(f"study: {own!r}, the baseline of {arm.label!r}, is not trained on "
+                       f"{', '.join(sorted(missing))}")  # fmt: skip
     if source is not None:
         if ARMS[known[source].arm]["filter"] != "sauna":
             raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")
         if set(arm.tasks) - set(known[source].tasks) or arm.seeds != known[source].seeds:
             raise BadInput(f"study: {source!r} must have the tasks and the seeds of {arm.label!r}")
-    own = arm.baseline or (None if arm.label == baseline else baseline)
+        arm = arm._replace(settings={**_rules_of(known[source], arm), **arm.settings})
     return arm._replace(baseline=own, rates_of=source)
+
+
+def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
+    """The rules of a filtered arm that a coin which repeats its drop rates has to share."""
+    theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, coin))
+    return {
+        name: theirs[name]
+        for name in SHARED_RULES
+        if theirs[name] != own[name] and reads(coin.arm, coin.settings, name)
+    }
 
 
 def check(arm: Arm, task: str) -> Config:

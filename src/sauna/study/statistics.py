@@ -70,7 +70,8 @@ def iqm_estimate(strata: Sequence[np.ndarray]) -> Estimate:
     Seeds are drawn with replacement within each task, so that every resample holds all tasks.
     Percentile intervals as in rliable. BCa was measured and covers no better at 3 to 10 seeds.
     Both are too narrow there: on normal scores of one task the percentile interval holds the true
-    IQM in 73% of trials with 3 seeds, 91% with 6, 92% with 10, 94% with 30. No verdict rests on it.
+    IQM in 76% of trials with 3 seeds, 91% with 6, 93% with 10, 94% with 30
+    (`results/intervals.json`). No verdict rests on it.
 
     Args:
       strata: a vector of scores per task.
@@ -122,9 +123,8 @@ def improvement_estimate(x: np.ndarray, y: np.ndarray) -> Estimate:
     (Newcombe's method 5). At `t = 1/2` that is the variance of U under equal distributions, and
     the last term is the test's correction for continuity, so 1/2 lies outside where the test
     rejects it. A bootstrap would be the usual choice, but for normal scores 0 to 2 standard
-    deviations apart its interval holds the true value in 37% to 84% of trials with 3 seeds of
-    each and 73% to 92% with 6; this one in 96% or more of either, and in 90% or more for scores
-    of which one in five comes from a second, far higher mode.
+    deviations apart its interval holds the true value in 36% to 80% of trials with 3 seeds of
+    each and 71% to 94% with 6; this one in 95% or more of either (`results/intervals.json`).
     """
     value = improvement(x, y)
     if min(len(x), len(y)) < 2:
@@ -348,7 +348,8 @@ def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
     A bootstrap of 3 to 6 members is too narrow even for normal values, where t is right. Nothing
     helps where few runs stand far above the rest, as the members seen may hold none of them: with
-    one in five, it held the true mean in 56% of trials with 3 members, 76% with 6, 88% with 10.
+    one in five 10 standard deviations above, it holds the true mean in 77% of trials with 3
+    members or 6, 90% with 10 (`results/intervals.json`).
     NaN where any member has no value; the ends also with one member.
     """
     number = len(values)

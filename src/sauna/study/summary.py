@@ -262,6 +262,8 @@ def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[
         said = []
         if not low <= 0.5 <= high:
             said.append("The interval leaves out 0.5, but the test, which decides, does not.")
+        elif comparison.p < ALPHA:
+            said.append("The test rejects, but the interval, which has to agree, holds 0.5.")
         if comparison.needed is not None and comparison.needed > min(n, m):
             said.append(
                 f"Were the difference seen the true one, {_about(comparison.needed)} seeds of "

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from sauna.study.numbers import digits_of
+
 MINUS, DOT = "\N{MINUS SIGN}", "\N{MIDDLE DOT}"
 # Table 1 of the SAUNA paper, as printed.
 PAPER: dict[str, dict[str, tuple[float, float]]] = {
@@ -41,12 +43,6 @@ def number(value: float | None, digits: int) -> str:
         return "-"
     shown = f"{value:,.{digits}f}".replace("-", MINUS)
     return f'<data value="{json.dumps(value)}">{shown}</data>'
-
-
-def digits_of(values: Iterable[float | None]) -> int:
-    """Decimals that leave three or four digits of the largest, as papers print returns."""
-    largest = max((abs(v) for v in values if v is not None), default=0.0)
-    return 0 if largest >= 500 else 1 if largest >= 10 else 2 if largest >= 1 else 3
 
 
 def with_interval(values: Sequence[float | None] | None, digits: int) -> str:
@@ -238,7 +234,9 @@ def _cell(cell: Mapping[str, Any], base: Mapping[str, Any] | None) -> str:
     head = ["Setting", "Value"] + (
         [f"Where {escape(base['label'])} differs"] if base and other is not own else []
     )
-    rows = []
+    revisions = [_value(c.get("git")) for c in ([cell, base] if base else [cell])]
+    revisions[1:] = ["" if revisions[0] == other else other for other in revisions[1:]]
+    rows = [("git revision", revisions[: len(head) - 1])]
     for key, value in own.items():
         differs = _value(other.get(key)) if other.get(key) != value else ""
         rows.append((escape(key), [_value(value), differs][: len(head) - 1]))

@@ -1,7 +1,8 @@
 """A study's work in units: each is an ordinary run of a few seeds of one arm on one task.
 
-A unit's folder is named after its settings, so that studies which share settings share the work,
-and a study that is run again finds what is done.
+A unit's folder is named after its settings (those that differ from a run's defaults, however they
+were written), so that studies which share settings share the work, and a study that is run again
+finds what is done.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sauna import rundir
-from sauna.study.spec import Arm, Spec
+from sauna.config import Config, to_json
+from sauna.study.spec import Arm, Spec, check
 
 SEEDS = 3  # per unit: members of one process share the cost of each vector step
 
@@ -55,9 +57,15 @@ class Unit(NamedTuple):
 
 
 def seeds_per_unit(spec: Spec, cores: int) -> int:
-    """As many as share a process well, or fewer where cores would stay idle."""
-    members = sum(len(arm.seeds) * len(arm.tasks) for arm in spec.arms)
-    return max(1, min(SEEDS, -(-members // cores)))
+    """As many as share a process well, or fewer where cores would stay idle at the start, when arms
+    that repeat others' drop rates have to wait; as even as can be without another unit."""
+    first = [arm for arm in spec.arms if arm.rates_of is None]
+
+    def units(size: int) -> int:
+        return sum(-(-len(arm.seeds) // size) * len(arm.tasks) for arm in first)
+
+    most = next((size for size in range(SEEDS, 1, -1) if units(size) >= cores), 1)
+    return next(size for size in range(1, SEEDS + 1) if units(size) == units(most))
 
 
 def most_seeds(spec: Spec) -> int:
@@ -85,11 +93,30 @@ def _parts(arm: Arm, size: int) -> Iterator[tuple[int, ...]]:
 def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
     source = _unit(arms, arms[arm.rates_of], task, seeds).name if arm.rates_of else None
     settings = arm.given(task, seeds)
-    text = json.dumps([settings, source], sort_keys=True)
-    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    digest = digest_of([identity(arm, task, seeds), source])
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in task)
     name = f"{place}_{arm.arm}_{seeds[0]}-{seeds[-1]}_{digest}"
     return Unit(name, task, arm.label, seeds, settings, source)
+
+
+def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
+    """What of a run's config differs from the defaults: the same for the same training."""
+    config, usual = to_json(check(arm._replace(seeds=seeds), task)), to_json(Config())
+    return {name: value for name, value in config.items() if value != usual[name]}
+
+
+def study_identity(spec: Spec) -> list[Any]:
+    """Everything that a study trains and compares: the same for the same study."""
+    return [
+        [arm.label, arm.baseline, arm.rates_of, identity(arm, task, arm.seeds)]
+        for arm in spec.arms
+        for task in arm.tasks
+    ] + [spec.measure]
+
+
+def digest_of(values: Any) -> str:
+    """A name for JSON values."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
 def split(unit: Unit, folder: Path) -> list[Unit]:

@@ -1,4 +1,4 @@
-"""What a person sees while a study runs: arms x tasks with their progress, or lines of text."""
+"""What a person sees while a study runs: arms x tasks with their seeds, or lines of text."""
 
 from __future__ import annotations
 
@@ -8,61 +8,113 @@ from pathlib import Path
 from typing import Any
 
 from sauna import rundir
-from sauna.metrics.display import duration, number
+from sauna.config import Config
+from sauna.metrics.display import duration
 from sauna.study.spec import Spec, check
 from sauna.study.units import Unit, parts
 
 PLAIN_SECONDS = 30.0  # between two progress lines where there is no terminal
+LIVE_SECONDS = 0.25
+NAMED = 4  # arms that a progress line names
+BARS = "▁▂▃▄▅▆▇█"
+WAITING, DONE, FAILED = "·", "✓", "✗"
+
+
+class Cell:
+    """One arm on one task: what is known of its seeds."""
+
+    def __init__(self, config: Config) -> None:
+        self.seeds = config.seeds
+        self.latest: dict[int, dict[str, Any]] = {}  # seed -> its last row
+        self.complete: set[int] = set()
+        self.failed: set[int] = set()
+        self._budget = f"{config.budget}_steps"
+        batch = config.rollout_steps * config.envs
+        self._usable = config.steps // batch * batch
+        self._since: tuple[float, int] | None = None  # when training was first heard of, and where
+        self._last = (0.0, 0)
+
+    def note(self, row: dict[str, Any], trained: bool) -> None:
+        """A seed's newest row; `trained` unless it is only told again by a run that continues."""
+        self.latest[row["seed"]] = row
+        steps = sum(row["env_steps"] for row in self.latest.values())
+        if trained:
+            self._last = (time.monotonic(), steps)
+        if self._since is None or not trained:
+            self._since = (time.monotonic(), steps)
+
+    def share(self, seed: int) -> float:
+        """How much of what it can use of its budget a seed has used; 1 once it has ended."""
+        if seed in self.complete | self.failed:
+            return 1.0
+        row = self.latest.get(seed)
+        return min(row[self._budget] / max(self._usable, 1), 1.0) if row else 0.0
+
+    def is_running(self) -> bool:
+        return any(seed in self.latest and self.share(seed) < 1 for seed in self.seeds)
+
+    def marks(self) -> str:
+        """A character for each seed: waiting, a bar as high as its progress, complete, failed."""
+        return "".join(map(self._mark, self.seeds))
+
+    def _mark(self, seed: int) -> str:
+        if seed in self.failed:
+            return FAILED
+        if seed in self.complete:
+            return DONE
+        share = self.share(seed)
+        return BARS[min(int(share * len(BARS)), len(BARS) - 1)] if seed in self.latest else WAITING
+
+    def mean(self, name: str) -> float | None:
+        """Over the seeds that have the number, failed ones left out."""
+        rows = [row for seed, row in self.latest.items() if seed not in self.failed]
+        values = [row[name] for row in rows if name in row]
+        return sum(values) / len(values) if values else None
+
+    def rate(self) -> float | None:
+        """Env steps per second, since training was first heard of."""
+        if self._since is None or not self.is_running() or self._last[0] <= self._since[0]:
+            return None
+        return (self._last[1] - self._since[1]) / (self._last[0] - self._since[0])
 
 
 class StudyView:
-    """Latest row of every member; a live table on a terminal."""
+    """A live table on a terminal, a line of text now and then elsewhere; nothing where quiet."""
 
-    def __init__(self, spec: Spec, units: list[Unit], folder: Path) -> None:
-        self._units = units
+    def __init__(self, spec: Spec, units: list[Unit], folder: Path, quiet: bool = False) -> None:
+        self._quiet = quiet
         self._configs = {
             (arm.label, task): check(arm, task) for arm in spec.arms for task in arm.tasks
         }
-        self._same: dict[str, list[tuple[str, str]]] = {}  # a unit may serve several labels
-        self._latest: dict[tuple[str, str], dict[int, dict[str, Any]]] = {
-            key: {} for key in self._configs
-        }
-        self._failed: dict[tuple[str, str], set[int]] = {key: set() for key in self._configs}
+        self._cells = {key: Cell(config) for key, config in self._configs.items()}
+        self._same: dict[str, list[Cell]] = {}  # a unit may serve several labels
         for unit in units:
-            self._same.setdefault(unit.name, []).append((unit.label, unit.task))
+            cell = self._cells[unit.label, unit.task]
+            self._same.setdefault(unit.name, []).append(cell)
             for part in parts(unit, folder):
                 if part.error(folder) is not None:
-                    self._failed[unit.label, unit.task] |= set(part.seeds)
+                    cell.failed |= set(part.seeds)
+                if part.is_complete(folder):
+                    cell.complete |= set(part.seeds)
                 for row in rundir.rows(part.run(folder)):
-                    self._latest[unit.label, unit.task][row["seed"]] = row
+                    cell.note(row, trained=False)
         self._first = (time.monotonic(), self._done())
         self._shown = 0.0
         self._live: Any = None
 
+    def _members(self) -> int:
+        return sum(len(cell.seeds) for cell in self._cells.values())
+
     def _done(self) -> float:
         """Members' worth of work that is done."""
-        return sum(
-            len(self._failed[key])
-            + sum(
-                self._share(key, row)
-                for seed, row in members.items()
-                if seed not in self._failed[key]
-            )
-            for key, members in self._latest.items()
-        )
-
-    def _share(self, key: tuple[str, str], row: dict[str, Any]) -> float:
-        """How much of its budget a member has used, of what it can use."""
-        config = self._configs[key]
-        batch = config.rollout_steps * config.envs
-        return float(min(row[f"{config.budget}_steps"] / (config.steps // batch * batch), 1.0))
+        return sum(cell.share(seed) for cell in self._cells.values() for seed in cell.seeds)
 
     def open(self) -> None:
-        if sys.stdout.isatty():
+        if sys.stdout.isatty() and not self._quiet:
             from rich.console import Console
             from rich.live import Live
 
-            self._live = Live(console=Console(), auto_refresh=False, vertical_overflow="visible")
+            self._live = Live(console=Console(), auto_refresh=False, vertical_overflow="crop")
             self._live.start()
 
     def close(self) -> None:
@@ -72,23 +124,27 @@ class StudyView:
             self._live = None
 
     def progress(self, unit: Unit, message: dict[str, Any]) -> None:
-        for row in message.get("rows", []) + message.get("resumed", []):
-            for key in self._keys(unit):
-                self._latest[key][row["seed"]] = row
-        if "said" in message and not message["said"].startswith("warning: MuJoCo"):
+        for cell in self._served(unit):
+            for row in message.get("resumed", []):
+                cell.note(row, trained=False)
+            for row in message.get("rows", []):
+                cell.note(row, trained=True)
+        if "said" in message:
             self.say(f"{unit.task}, {unit.label}: {message['said']}")
 
     def ended(self, unit: Unit, error: str | None) -> None:
+        for cell in self._served(unit):
+            (cell.complete if error is None else cell.failed).update(unit.seeds)
         if error is not None:
-            for key in self._keys(unit):
-                self._failed[key] |= set(unit.seeds)
             seeds = ", ".join(map(str, unit.seeds))
             self.say(f"FAILED: {unit.task}, {unit.label}, seed {seeds}: {error}")
 
-    def _keys(self, unit: Unit) -> list[tuple[str, str]]:
-        return self._same.get(unit.name.split("/")[0], [(unit.label, unit.task)])
+    def _served(self, unit: Unit) -> list[Cell]:
+        return self._same.get(unit.name.split("/")[0], [self._cells[unit.label, unit.task]])
 
     def say(self, text: str) -> None:
+        if self._quiet:
+            return
         if self._live is not None:
             self._live.console.print(text, highlight=False, markup=False)
         else:
@@ -96,47 +152,57 @@ class StudyView:
 
     def refresh(self) -> None:
         now = time.monotonic()
+        if now - self._shown < (PLAIN_SECONDS if self._live is None else LIVE_SECONDS):
+            return
+        self._shown = now
         if self._live is not None:
-            if now - self._shown > 0.25:
-                self._shown = now
-                self._live.update(self._table(), refresh=True)
-        elif now - self._shown > PLAIN_SECONDS:
-            self._shown = now
-            self.say(self._status())
+            self._live.update(self._table(), refresh=True)
+        else:
+            self.say(self._status() + self._named())
 
     def _status(self) -> str:
         started, before = self._first
-        members = sum(len(unit.seeds) for unit in self._units)
-        done, spent = self._done(), time.monotonic() - started
+        members, done, spent = self._members(), self._done(), time.monotonic() - started
         text = f"{done / members:.1%} of {members} members"
         if done > before and spent > 5:
             per_second = (done - before) / spent
             steps = sum(c.steps for c in self._configs.values()) / len(self._configs)
             left = duration((members - done) / per_second)
             text += f", {per_second * steps:,.0f} env steps/s, {left} left"
-        failed = sum(map(len, self._failed.values()))
+        failed = sum(len(cell.failed) for cell in self._cells.values())
         return text + (f", {failed} failed" if failed else "")
+
+    def _named(self) -> str:
+        """The arms in training, as text."""
+        running = [(key, cell) for key, cell in self._cells.items() if cell.is_running()]
+        told = "".join(
+            f"; {label} on {task} {cell.marks()} return {_number(cell.mean('return_mean'), 1)}, "
+            f"keep rate {_number(cell.mean('keep_rate'), 3)}"
+            for (label, task), cell in running[:NAMED]
+        )
+        return told + (f"; {len(running) - NAMED} more" if len(running) > NAMED else "")
 
     def _table(self) -> Any:
         from rich.table import Table
 
+        shown = self._cells
+        if self._live is not None and len(shown) > self._live.console.height - 4:
+            shown = {key: cell for key, cell in shown.items() if cell.is_running()}
         table = Table(title=self._status(), title_justify="left", box=None)
-        for column in ("task", "arm"):
+        for column in ("task", "arm", "seeds"):
             table.add_column(column)
-        for column in ("seeds done", "progress", "return", "keep rate"):
+        for column in ("progress", "return", "keep rate", "env steps/s"):
             table.add_column(column, justify="right")
-        for (label, task), members in self._latest.items():
-            seeds = sum(len(u.seeds) for u in self._units if (u.label, u.task) == (label, task))
-            rows = list(members.values())
-            shares = [self._share((label, task), row) for row in rows]
-            share, ended = sum(shares) / seeds, sum(share > 0.99 for share in shares)
-            means = {
-                name: sum(row[name] for row in rows) / len(rows)
-                for name in ("return_mean", "keep_rate")
-                if rows and all(name in row for row in rows)
-            }
+        for (label, task), cell in shown.items():
+            share = sum(map(cell.share, cell.seeds)) / len(cell.seeds)
             table.add_row(
-                task, label, f"{ended} of {seeds}", f"{share:.0%}",
-                number(means, "return_mean", ".1f"), number(means, "keep_rate", ".3f"),
+                task, label, cell.marks(), f"{share:.0%}", _number(cell.mean("return_mean"), 1),
+                _number(cell.mean("keep_rate"), 3), _number(cell.rate(), 0),
             )  # fmt: skip
+        if len(shown) < len(self._cells):
+            table.caption = f"{len(self._cells) - len(shown)} more lines are complete or waiting"
         return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
