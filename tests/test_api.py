@@ -136,7 +136,7 @@ def test_videos_are_written_and_read_back(tmp_path) -> None:
 
 
 def test_no_video_is_said_plainly(result) -> None:
-    with pytest.raises(sauna.SaunaError, match=r"video: .*rendered here|env: .*cannot be made"):
+    with pytest.raises(sauna.SaunaError, match=r"video: .*drawn here|env: .*cannot be made"):
         sauna.evaluate(result.path, episodes=1, video=True)
 
 
@@ -159,6 +159,12 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in rundir.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
+    command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-pictures"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (page,) = (tmp_path / "run").glob("inspect_*.html")
+    told = page.read_text()  # its rule is not eq. 7, and nothing is made up about it
+    assert "The filter is my_filters:lower_half" in told and "inside the band" not in told
 
 
 def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:

@@ -16,7 +16,7 @@ from helpers import environment
 from sauna.errors import BadInput
 from sauna.measure.coverage import particle_entropy
 from sauna.study.dial import correlation, extra, marks, text_table, verdicts
-from sauna.study.measuring import POINTS
+from sauna.study.measuring import ALONG
 from sauna.study.spec import load_spec, read_spec
 
 
@@ -75,10 +75,12 @@ def test_every_arm_stands_at_its_threshold() -> None:
         cell("0 to 1", [0.5], threshold=1.0, threshold_schedule="rising"),
         cell("keeps half", [0.7], keep_rate_target=0.5),
         cell("coin", [0.1], arm="random-drop", rates_of="0.5"),
+        cell("moved coin", [0.1], arm="random-drop", rates_of="0 to 1"),
     ]
     found = {mark.label: mark for mark in marks(study(*RISING, *others), "A-v0")}
     assert {label: mark.threshold for label, mark in found.items()} == {
         "0.0": 0.0, "0.5": 0.5, "1.0": 1.0, "0 to 1": 0.9, "keeps half": 0.9, "coin": 0.5,
+        "moved coin": 0.9,
     }  # fmt: skip
     assert [found[x].kind for x in ("0 to 1", "keeps half")] == ["scheduled", "held keep rate"]
     page = extra(study(*RISING, *others))
@@ -86,7 +88,17 @@ def test_every_arm_stands_at_its_threshold() -> None:
         "dial_keep_rate", "dial_entropy", "dial_coverage", "dial_final_return",
     ]  # fmt: skip
     assert len(page.plots[1].panels[0].lines) == 4
-    assert len(text_table(study(*RISING, *others))) == 7
+    assert len(text_table(study(*RISING, *others))) == 8
+
+
+def test_what_is_the_same_for_all_follows_nothing() -> None:
+    """And does not keep the other two from being told."""
+    same = [cell(str(t), [t] * 4, threshold=t) for t in (0.0, 0.5, 1.0)]
+    for one in same:
+        for member in one["members"]:
+            member["final_return"] = 1000.0
+    told = verdicts(study(*same))[0]
+    assert "moves exploration, with no evidence that return follows" in told
 
 
 def test_the_scale_needs_a_normaliser() -> None:
@@ -95,6 +107,8 @@ def test_the_scale_needs_a_normaliser() -> None:
     assert read_spec(spec).measure == "dial"
     with pytest.raises(BadInput, match="normalize_observations: dial"):
         read_spec({**spec, "normalize_observations": False})
+    with pytest.raises(BadInput, match="not of ppo"):
+        read_spec({**spec, "arms": [{"label": "sauna"}, {"label": "ppo"}]})
 
 
 @pytest.mark.slow
@@ -122,12 +136,13 @@ def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> 
     assert "measuring" in run()
     place = tmp_path / "runs" / "small"
     files = {path: path.stat().st_mtime_ns for path in (place / name).glob("*.json")}
-    arms = len(text["arms"])
-    assert len(files) == arms * 2 * len(POINTS)
     assert "measuring" not in run()
     assert files == {path: path.stat().st_mtime_ns for path in files}
     measured = json.loads((place / f"{name}.json").read_text())
-    assert all(len(m["points"]) == len(POINTS) for c in measured["cells"] for m in c["members"])
+    members = [member for cell in measured["cells"] for member in cell["members"]]
+    number = [len(member["points"]) for member in members]  # a checkpoint serves one point only
+    assert len(members) == 2 * len(text["arms"]) and sum(number) == len(files)
+    assert set(number) <= {len(ALONG) - 1, len(ALONG)} and len(ALONG) in number
     page = (place / "report.html").read_text()
     assert 'id="measured"' in page and f"{name}_" in page
     if name == "dial":

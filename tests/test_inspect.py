@@ -29,9 +29,11 @@ from sauna.inspection.examined import (
     Inspection,
     _stream,
     examine,
+    pixel_stride,
     principal_components,
     scaled,
 )
+from sauna.inspection.page import meaning
 from sauna.inspection.played import MOST, SIDE, Pictures, Recorder, _played
 from sauna.selection.filters import decide as decide_stretch
 from sauna.selection.filters import make_filter
@@ -98,6 +100,7 @@ def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) ->
     medians, keep, rollouts = by_hand(config, vex)
     assert made.keep.tolist() == keep and made.rollouts == rollouts and len(rollouts) > 1
     np.testing.assert_allclose(made.median, medians, rtol=1e-6)
+    np.testing.assert_allclose(made.edge, THRESHOLD * (np.abs(medians) + 1e-8), rtol=1e-6)
     np.testing.assert_array_equal(
         made.prediction, vex.mean(1) if decision == "joint" else vex[:, 0]
     )
@@ -139,6 +142,28 @@ def test_without_a_filter_everything_is_kept() -> None:
     config = configured(arm="ppo", rollout_steps=16, minibatches=1)
     made = decide(config, np.zeros((40, 1, 1)), np.ones((40, 1)), None, hypers_of(config))
     assert made.keep.all() and np.isnan(made.median).all() and made.rollouts == [0, 16, 32]
+
+
+def test_a_held_keep_rate_has_an_edge_that_moves() -> None:
+    config = configured(arm="sauna", keep_rate_target=0.6, rollout_steps=64, minibatches=1)
+    vex = np.random.default_rng(4).normal(size=(90, 1)).astype(np.float32)
+    made = decide(config, np.zeros((90, 1, 1)), vex, jax.random.key(0), hypers_of(config))
+    assert abs(made.keep.mean() - 0.6) < 0.05
+    known = np.isfinite(made.edge)
+    assert known.sum() > 70
+    size = np.abs(vex[:, 0])
+    np.testing.assert_array_equal(made.keep[known], (size >= made.edge)[known])
+    assert made.median[5] == pytest.approx(np.median(size[:5]))
+
+
+def test_the_units_of_signs_are_signs(run, found) -> None:
+    config = dataclasses.replace(
+        found.member.config, normalize_rewards=False, sign_rewards=True, dropped="mask"
+    )
+    changed = found._replace(member=found.member._replace(config=config))
+    told = meaning(changed)
+    assert "in signs of rewards." in told and "raw units" not in told
+    assert f"A rollout ends after {config.rollout_steps} env steps" in told
 
 
 def test_a_run_is_decided_by_its_own_head_and_settings(run, found) -> None:
@@ -219,6 +244,15 @@ def test_principal_components() -> None:
     line, shares = principal_components(np.arange(4.0)[:, None])
     assert line is not None and shares == [1.0]
     np.testing.assert_allclose(line, [[-1.5, 0], [-0.5, 0], [0.5, 0], [1.5, 0]], atol=1e-12)
+
+
+def test_principal_components_of_many_pictures_are_those_of_some_pixels() -> None:
+    seen = np.zeros((1000, 84, 84, 4), np.uint8)
+    seen[:500, ::2] = 255
+    assert pixel_stride(seen) == 2
+    points, shares = principal_components(seen)
+    assert points is not None and shares[0] == pytest.approx(1.0)
+    assert len(np.unique(np.sign(points[:500, 0]))) == len(np.unique(np.sign(points[500:, 0]))) == 1
 
 
 def test_pictures_are_few_small_and_of_their_steps(run) -> None:

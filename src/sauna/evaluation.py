@@ -15,7 +15,7 @@ import numpy as np
 from sauna import rundir
 from sauna.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.envs.gymnasium import make_drawn_env, make_env
-from sauna.errors import BadInput, SaunaError
+from sauna.errors import BadInput, SaunaError, one_line
 
 if TYPE_CHECKING:
     from sauna.trained import TrainedPolicy
@@ -145,10 +145,7 @@ def film(
     except SaunaError:
         raise
     except Exception as error:  # renderers fail in every way there is
-        raise SaunaError(
-            f"video: this environment cannot be rendered here ({type(error).__name__}: {error}); "
-            f"without a display MuJoCo needs libegl1 or libosmesa6"
-        ) from error
+        raise SaunaError(f"video: {not_drawn(error)}") from error
     if not frames or frames[0] is None:
         raise SaunaError("video: the environment gives no pictures (render_mode rgb_array)")
     import imageio.v3 as imageio
@@ -163,6 +160,14 @@ def film(
         warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
         imageio.imwrite(path, np.stack(frames), fps=rate, macro_block_size=1)
     return path
+
+
+def not_drawn(error: Exception) -> str:
+    """Why an environment cannot be drawn, in a line, and what may help where OpenGL is missing."""
+    text = str(error) if isinstance(error, SaunaError) else one_line(error)
+    missing = any(word in text for word in ("GL", "Mesa", "isplay"))
+    help = "; without a display MuJoCo needs libegl1 or libosmesa6" * missing
+    return f"it cannot be drawn here: {text}{help}"
 
 
 def choose_renderer() -> None:

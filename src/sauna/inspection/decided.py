@@ -18,14 +18,26 @@ from sauna.collect.collected import capacity
 from sauna.config import Config
 from sauna.core.batch import advantages_over_all, advantages_over_kept, kept_rows
 from sauna.core.types import Array, Hypers, Rollout
-from sauna.selection.filters import Filter, History, make_filter, median
+from sauna.selection.filters import (
+    EPSILON,
+    Filter,
+    Held,
+    History,
+    held_edge,
+    make_filter,
+    median,
+)
 
 
 class Decisions(NamedTuple):
-    """Of one environment's `L` env steps."""
+    """Of one environment's `L` env steps.
+
+    Median and edge are NaN where there are no earlier predictions, and for a user's own filter.
+    """
 
     prediction: np.ndarray  # [L] x of eq. 7: the head's Vex, for a joint decision its mean
-    median: np.ndarray  # [L] of the earlier predictions; NaN where there are none
+    median: np.ndarray  # [L] of the earlier predictions (of |Vex| where a keep rate is held)
+    edge: np.ndarray  # [L] below which |x| is dropped
     keep: np.ndarray  # [L] bool
     rollouts: list[int]  # the steps at which a rollout begins
 
@@ -39,24 +51,40 @@ def environments(config: Config) -> int:
     return 1 if alone else config.envs
 
 
-@partial(jax.jit, static_argnames="filter")
-def trace(
-    filter: Filter, state: Any, observation: Array, vex: Array, key: Array, hypers: Hypers
-) -> tuple[Array, Array]:
-    """The mask `[S, N]` of `selection.filters.decide`, and the median before each step.
+def standards(config: Config, state: Any, hypers: Hypers) -> tuple[Array, Array]:
+    """What the next prediction is held against: the median and the edge, `[N]` or `[1]` each."""
+    if config.filter != "sauna":
+        return jnp.full(1, jnp.nan), jnp.full(1, jnp.nan)
+    history = state.history if isinstance(state, Held) else state
+    assert isinstance(history, History)
+    middle = median(history)
+    edge = hypers.threshold * (jnp.abs(middle) + EPSILON)
+    if isinstance(state, Held):
+        least = held_edge(state, config.keep_rate_target)
+        edge = jnp.where(jnp.isposinf(least), jnp.nan, jnp.maximum(least, 0.0))
+    known = history.number > 0
+    return tuple(jnp.atleast_1d(jnp.where(known, x, jnp.nan)) for x in (middle, edge))  # type: ignore[return-value]
 
-    The median is `[S, N]`, of a joint history `[S, 1]`; NaN before the first entry, and for
-    filters without a `History`.
+
+@partial(jax.jit, static_argnames=("config", "filter"))
+def trace(
+    config: Config,
+    filter: Filter,
+    state: Any,
+    observation: Array,
+    vex: Array,
+    key: Array,
+    hypers: Hypers,
+) -> tuple[Array, tuple[Array, Array]]:
+    """The mask `[S, N]` of `selection.filters.decide`, and the `standards` before each step.
 
     Args:
       observation: `[S, N, *obs]`; vex: `[S, N]`.
     """
 
-    def step(state: Any, row: tuple[Array, Array, Array]) -> tuple[Any, tuple[Array, Array]]:
+    def step(state: Any, row: tuple[Array, Array, Array]) -> tuple[Any, Any]:
         t, seen, x = row
-        before = jnp.full(1, jnp.nan)
-        if isinstance(state, History):
-            before = jnp.atleast_1d(jnp.where(state.number > 0, median(state), jnp.nan))
+        before = standards(config, state, hypers)
         state, kept = filter.keep(state, seen, x, jax.random.fold_in(key, t), hypers)
         return state, (kept, before)
 
@@ -78,24 +106,28 @@ def decide(
     joint = config.filter == "sauna" and config.decision == "joint"
     prediction = vex.mean(1) if joint else vex[:, 0]
     if filter is None:
-        return Decisions(prediction, np.full(steps, np.nan), np.ones(steps, bool),
+        nothing = np.full(steps, np.nan)
+        return Decisions(prediction, nothing, nothing, np.ones(steps, bool),
                          list(range(0, steps, room)))  # fmt: skip
-    medians, keep = np.zeros(steps), np.zeros(steps, bool)
+    before, keep = np.zeros((2, steps)), np.zeros(steps, bool)
     rollouts: list[int] = []
     start = 0
     longest = min(room, steps)
     while start < steps:
         rows = [_stretch(x, start, longest) for x in (observation, vex)]
         rollout_key = jax.random.fold_in(key, len(rollouts))
-        mask, before = trace(filter, filter.init(vex.shape[1], room), *rows, rollout_key, hypers)
+        first = filter.init(vex.shape[1], room)
+        mask, standard = trace(config, filter, first, *rows, rollout_key, hypers)
         own = np.asarray(mask)[:, 0]
         full = np.flatnonzero(np.cumsum(own) == config.rollout_steps)
         tried = min(int(full[0]) + 1 if len(full) else longest, steps - start)
         keep[start : start + tried] = own[:tried]
-        medians[start : start + tried] = np.asarray(before)[:tried, 0]
+        for own_row, values in zip(before, standard, strict=True):
+            own_row[start : start + tried] = np.asarray(values)[:tried, 0]
         rollouts.append(start)
         start += tried
-    return Decisions(prediction, medians, keep, rollouts)
+    medians, edges = before
+    return Decisions(prediction, medians, edges, keep, rollouts)
 
 
 def _stretch(x: np.ndarray, start: int, length: int) -> np.ndarray:

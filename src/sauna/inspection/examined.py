@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -146,14 +147,23 @@ def _stream(
     return Rollout(*fields)
 
 
+def pixel_stride(observation: np.ndarray) -> int:
+    """Of pictures `[L, H, W, C]`, each how manyth row and column their components are taken of."""
+    if observation.ndim < 4:
+        return 1
+    return max(1, math.ceil(math.sqrt(observation.size / LARGEST)))
+
+
 def principal_components(
     observation: np.ndarray,
 ) -> tuple[np.ndarray | None, list[float]]:
     """The first two principal components `[L, 2]` of `[L, *obs]`, and their shares of variance.
 
-    Of each component the sign is such that its largest loading is positive. None where the matrix
-    is too large.
+    Of each component the sign is such that its largest loading is positive. Of pictures only so
+    many pixels are looked at that the matrix stays small; None where it is too large all the same.
     """
+    every = pixel_stride(observation)
+    observation = observation[:, ::every, ::every] if every > 1 else observation
     if observation.size > LARGEST:
         return None, []
     flat = observation.reshape(len(observation), -1).astype(np.float64)

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from sauna.inspection.examined import Inspection
-from sauna.selection.filters import EPSILON
+from sauna.collect.collected import capacity
+from sauna.inspection.examined import Inspection, pixel_stride
 from sauna.study.page import asset, filled, rounded
 from sauna.study.tables import DOT, table
 
 SETTINGS = ("filter", "threshold", "threshold_schedule", "keep_rate_target", "drop_rate",
             "history", "decision", "dropped", "vex_target", "vex_coef", "rollout_steps", "envs",
             "gae_over", "truncation", "gamma", "gae_lambda", "normalize_observations",
-            "normalize_rewards")  # fmt: skip
+            "normalize_rewards", "sign_rewards")  # fmt: skip
 
 
 def make_page(found: Inspection, run: Path) -> str:
@@ -46,8 +46,8 @@ def make_page(found: Inspection, run: Path) -> str:
 
 
 def compares(found: Inspection) -> bool:
-    """Whether the head's prediction is compared with a median: a rule that can drop steps."""
-    return bool(found.hypers.threshold > 0) and bool(np.isfinite(found.decisions.median).any())
+    """Whether the head's prediction is held against an edge: a rule that can drop steps."""
+    return bool(found.hypers.threshold > 0) and bool(np.isfinite(found.decisions.edge).any())
 
 
 def shows_vex(found: Inspection) -> bool:
@@ -56,9 +56,9 @@ def shows_vex(found: Inspection) -> bool:
 
 def page_data(found: Inspection) -> dict[str, Any]:
     """What the script draws: a value per env step in every list of `series` and of the panels."""
-    played, decisions = found.played, found.decisions
+    played, decisions, config = found.played, found.decisions, found.member.config
     value, advantage = found.value.astype(float), found.advantage
-    scaled = " (normalised)" if found.member.config.normalize_rewards else ""
+    scaled = " (normalised)" if config.normalize_rewards else ""
     ends = np.flatnonzero(played.terminated | played.truncated)
     lines = {
         "value": ("V", value),
@@ -76,8 +76,8 @@ def page_data(found: Inspection) -> dict[str, Any]:
         panels.insert(0, {"name": "vex", "title": "Vex, predicted", "lines": ["vex"]})
         vex = {"vex": ("Vex", decisions.prediction.astype(float))}
         if compares(found):
-            edge = float(found.hypers.threshold) * (np.abs(decisions.median) + EPSILON)
-            vex |= {"median": ("running median", decisions.median), "edge": ("dropped below", edge)}
+            middle = "running median" + " of |Vex|" * (config.keep_rate_target > 0)
+            vex |= {"median": (middle, decisions.median), "edge": ("dropped below", decisions.edge)}
             panels[0] |= {"lines": ["vex", "median"], "band": "edge"}
         lines = vex | lines
     return {
@@ -130,9 +130,9 @@ def notes(found: Inspection) -> list[str]:
             f"Keep rate here {kept:.3f}; in the last iteration of training "
             f"{found.trained_keep_rate:.3f}."
         )
-    if config.keep_rate_target and config.filter == "sauna":
-        said.append(f"The threshold moves at every step so that {config.keep_rate_target:g} of "
-                    f"the steps are kept: there is no one band to draw.")  # fmt: skip
+    if config.filter not in ("none", "sauna", "random-drop"):
+        said.append(f"The filter is {config.filter}: what it drops is shaded, its rule is not "
+                    f"drawn.")  # fmt: skip
     if config.filter == "random-drop":
         said.append(f"random-drop: each step is dropped with a chance of "
                     f"{found.hypers.drop_rate:.3f}, whatever the head says.")  # fmt: skip
@@ -151,9 +151,14 @@ def states(found: Inspection) -> str:
     shares = " and ".join(f"{100 * share:.0f}%" for share in found.shares)
     return (
         f"<p>What the network saw at each step, along its first two principal components "
-        f"({shares} of the variance). Point at a state to go to its step.</p>"
+        f"({shares} of the variance{_thinned(found)}). Point at a state to go to its step.</p>"
         f'<div id="scatter"></div>'
     )
+
+
+def _thinned(found: Inspection) -> str:
+    every = pixel_stride(found.played.observation)
+    return f", of every {every}th row and column of pixels" if every > 1 else ""
 
 
 def meaning(found: Inspection) -> str:
@@ -167,20 +172,27 @@ def meaning(found: Inspection) -> str:
             + (f", mean over {config.envs} environments." if several else ".")
         )
     if compares(found):
+        held = config.keep_rate_target > 0
+        rule = (
+            f"below the quantile of the rollout's earlier ones that is moved at every step to keep "
+            f"{config.keep_rate_target:g} of all"
+            if held
+            else f"below {float(found.hypers.threshold):g} times |median|"
+        )
         said.append(
             f"<b>Running median</b>: of the rollout's earlier predictions "
-            f"({escape('all of them' if config.history == 'all' else 'those of kept steps')}). "
-            f"A step is <b>dropped</b> where |Vex| is below {float(found.hypers.threshold):g} "
-            f"times |median|: inside the band. A rollout ends with its "
-            f"{config.rollout_steps:,}th kept step; the next one begins with an empty history "
-            f"(dashed upright line)."
+            f"({'all of them' if config.history == 'all' else 'those of kept steps'}"
+            f"{', without their sign' * held}). A step is <b>dropped</b> where |Vex| is {rule}: "
+            f"inside the band. A rollout ends {_end_of_rollout(found)}; the next one begins with "
+            f"an empty history (dashed upright line)."
         )
     unit = (
         "Value, GAE return, advantage and reward are in the units that the value function learns: "
         "rewards divided by the standard deviation of the discounted return, frozen as in the "
         "checkpoint. The raw reward is the environment's."
         if config.normalize_rewards
-        else "Value, GAE return, advantage and reward are in the environment's raw units."
+        else "Value, GAE return, advantage and reward are in "
+        + ("signs of rewards." if config.sign_rewards else "the environment's raw units.")
     )
     over = " GAE runs over kept steps only, as in this arm's training." * (
         config.gae_over == "kept"
@@ -194,6 +206,14 @@ def meaning(found: Inspection) -> str:
     if len(found.played.returns) > 1:
         said.append("Solid upright lines: a new episode.")
     return "".join(f"<p>{text}</p>" for text in said)
+
+
+def _end_of_rollout(found: Inspection) -> str:
+    config = found.member.config
+    if config.dropped == "mask":
+        return f"after {config.rollout_steps:,} env steps"
+    return (f"with its {config.rollout_steps:,}th kept step, or after {capacity(config):,} env "
+            f"steps")  # fmt: skip
 
 
 def command(found: Inspection, run: Path) -> str:

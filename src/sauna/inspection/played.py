@@ -11,14 +11,13 @@ import numpy as np
 
 from sauna.envs.contract import episode_seed
 from sauna.envs.gymnasium import make_drawn_env, make_env
-from sauna.errors import BadInput, SaunaError, one_line
-from sauna.evaluation import choose_renderer, play
+from sauna.errors import BadInput, SaunaError
+from sauna.evaluation import choose_renderer, not_drawn, play
 from sauna.trained import TrainedPolicy
 
 SIDE = 192  # pixels of a picture's longer side
 MOST = 250  # pictures
 PER_SECOND = 20  # of the environment's clock: more would not be seen
-RENDERERS = "without a display MuJoCo needs libegl1 or libosmesa6"
 
 
 class Played(NamedTuple):
@@ -43,7 +42,7 @@ class Pictures:
 
     def __init__(self, env: Any, say: Callable[[str], None]) -> None:
         self._env, self._say = env, say
-        limit = getattr(env.spec, "max_episode_steps", None) or 1
+        limit = getattr(getattr(env, "spec", None), "max_episode_steps", None) or 1
         self._every = max(1, -(-limit // MOST), round(clock(env) / PER_SECOND))
         self._works = True
         self.taken: list[tuple[int, bytes]] = []
@@ -58,7 +57,7 @@ class Pictures:
                 raise SaunaError("the environment gives none (render_mode rgb_array)")
             self.taken.append((row, _encoded(drawn)))
         except Exception as error:  # renderers fail in every way there is
-            self._say(f"no pictures: {one_line(error)}; {RENDERERS}")
+            self._say(f"no pictures: {not_drawn(error)}")
             self._works, self.taken = False, []
         if len(self.taken) > MOST:
             self.taken, self._every = self.taken[::2], 2 * self._every
@@ -76,7 +75,7 @@ def _encoded(drawn: Any) -> bytes:
 
 def clock(env: Any) -> float:
     """Env steps in a second of the environment's own time."""
-    return float((env.metadata or {}).get("render_fps") or 30)
+    return float((getattr(env, "metadata", None) or {}).get("render_fps") or 30)
 
 
 class Recorder:
@@ -125,7 +124,7 @@ def open_world(
         except BadInput as error:
             os.environ.clear()
             os.environ.update(chosen)  # a renderer that fails may also fail the plain environment
-            say(f"no pictures: {error}; {RENDERERS}")
+            say(f"no pictures: {not_drawn(error)}")
     return make_env(env, kwargs), None
 
 

@@ -2,11 +2,11 @@
 
     python -m sauna.measure < settings
 
-The first line of standard input holds, as JSON, what is measured (`noise`, `dial`), the run, the
-member's name, the checkpoints' numbers, and the file that each measurement is written to; for
-`dial` also the run, the member and the checkpoint whose normaliser is the scale. What is written
-is whole, so that a process that is stopped loses only the checkpoint it was at. The end of standard
-input means that whoever asked is gone: the process ends. Mistakes are told as JSON lines.
+The first line of standard input holds, as JSON, what is measured (`noise`, `dial`, `torso`), the
+run, the member's name, the checkpoints' numbers, and the file that each measurement is written to;
+for `dial` also the run, the member and the checkpoint whose normaliser is the scale. What is
+written is whole, so that a process that is stopped loses only the checkpoint it was at. The end of
+standard input means that whoever asked is gone: the process ends. Mistakes are told as JSON lines.
 """
 
 from __future__ import annotations

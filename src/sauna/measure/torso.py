@@ -15,8 +15,7 @@ import numpy as np
 
 from sauna.artifact import Artifact
 from sauna.envs.gymnasium import make_drawn_env, make_env
-from sauna.errors import BadInput, one_line
-from sauna.evaluation import choose_renderer, play
+from sauna.evaluation import choose_renderer, not_drawn, play
 from sauna.trained import TrainedPolicy
 
 EPISODES = 5
@@ -76,10 +75,8 @@ def _draw(artifact: Artifact, name: str, kwargs: dict[str, Any], path: Path) -> 
     try:
         env = make_drawn_env(artifact.config.env, kwargs)
         play(TrainedPolicy(artifact, name, env), env, False, SEED, look)
-    except BadInput as error:
-        return {"stills": [], "not_drawn": str(error)}
     except Exception as error:  # renderers fail in every way there is
-        return {"stills": [], "not_drawn": one_line(error)}
+        return {"stills": [], "not_drawn": not_drawn(error)}
     strip = Image.new("RGB", (SIDE * len(pictures), SIDE))
     for place, picture in enumerate(pictures.values()):
         strip.paste(picture, (SIDE * place, 0))

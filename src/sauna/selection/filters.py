@@ -156,13 +156,18 @@ def sauna_at_rate(rate: float) -> Filter:
     def keep(
         state: Held, observation: Array, vex: Array, key: Array, hypers: Hypers
     ) -> tuple[Held, Array]:
-        size, number = jnp.abs(vex), state.history.number
-        level = (1.0 - rate) + (state.kept - rate * number) / SETTLE
-        least = quantile(state.history.ordered, number, level)
-        mask = ~(size < least) | (hypers.threshold <= 0)
+        size = jnp.abs(vex)
+        mask = ~(size < held_edge(state, rate)) | (hypers.threshold <= 0)
         return Held(insert(state.history, size), state.kept + mask), mask
 
     return Filter(init, keep)
+
+
+def held_edge(state: Held, rate: float) -> Array:
+    """What |Vex| has to reach to be kept at a held keep rate, `[N]`; see `sauna_at_rate`."""
+    number = state.history.number
+    level = (1.0 - rate) + (state.kept - rate * number) / SETTLE
+    return quantile(state.history.ordered, number, level)
 
 
 def quantile(ordered: Array, number: Array, level: Array) -> Array:
