@@ -169,6 +169,9 @@ def test_its_presets_are_the_published_numbers() -> None:
     other = resolve({"env": "x", "arm": "ppo", "preset": "a2c-mujoco"})
     changed = {name for name in FIELDS if getattr(other, name) != getattr(config, name)}
     assert changed == {"preset", "trunk", "entropy_coef"}
+    atari = resolve({"env": "x", "arm": "ppo", "preset": "a2c-atari"})
+    assert (atari.sign_rewards, atari.normalize_rewards) == (True, False)
+    assert (atari.trunk, atari.entropy_coef) == ("shared", 0.01)
     assert PRESET_HELP.keys() == PRESETS.keys()
 
 
@@ -188,7 +191,7 @@ def test_ppo_is_what_it_was() -> None:
         ({"algorithm": "a2c", "adam_epsilon": 1e-6}, "adam_epsilon: not read .* optimizer adam"),
         ({"rmsprop_decay": 0.9}, "rmsprop_decay: not read .* optimizer rmsprop"),
         ({"rmsprop_epsilon": 0.1}, "rmsprop_epsilon: not read"),
-        ({"algorithm": "a2c", "preset": "mujoco"}, "mujoco is not one of a2c's .a2c, a2c-mujoco."),
+        ({"algorithm": "a2c", "preset": "mujoco"}, "not one of a2c's .a2c, a2c-atari, a2c-mujoco."),
         ({"algorithm": "ppo", "preset": "a2c"}, "a2c is not one of ppo's"),
         ({"algorithm": "a3c"}, "unknown value 'a3c'.*did you mean 'a2c'"),
         ({"algorithm": "a2c", "steps": 79}, "less than one rollout of 80"),

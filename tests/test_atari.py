@@ -107,7 +107,7 @@ def test_frames_before_the_first_observation_are_bounded_and_drawn() -> None:
         return {env.reset(seed=seed)[1]["frames"] for seed in range(seeds)}
 
     some = frames(6, noop_max=4)
-    assert len(some) > 1 and some <= {1, 2, 3}
+    assert len(some) > 1 and some <= {1, 2, 3, 4}
     assert frames(2, noop_max=0) == {1}, "FIRE alone"
     assert frames(2, noop_max=0, use_fire_reset=False) == {0}
 
@@ -136,7 +136,7 @@ def test_all_backends_step_alike(make: Callable[..., HostEnvs]) -> None:
     assert before.dtype == np.uint8
     np.testing.assert_array_equal(before, other.reset())
     lost, over = 0, 0
-    for t, row in enumerate(played(200)):
+    for t, row in enumerate(played(300)):
         active = np.array([True, t % 4 != 0])
         one, two = envs.step(row, active), other.step(row, active)
         assert_same_step(one, two)
@@ -154,7 +154,7 @@ def test_the_seeds_are_the_episodes_own() -> None:
     """Against ale-py's vector environment as it comes: both games, from the same seeds."""
     envs = make_here()
     seeds = np.array([episode_seed(*pair, 0) % 2**31 for pair in SEEDS])
-    plain = AtariVectorEnv("breakout", 2, reward_clipping=False)
+    plain = AtariVectorEnv("breakout", 2, reward_clipping=False, noop_max=31)
     np.testing.assert_array_equal(np.moveaxis(plain.reset(seed=seeds)[0], 1, -1), envs.reset())
     for row in played(20):
         observation, reward, *_ = plain.step(row[:, 0])
@@ -198,7 +198,7 @@ def test_a_time_limit_shows_what_was_reached() -> None:
     limited = in_process_envs(BREAKOUT, {"max_num_frames_per_episode": 43}, [(3, 0)], "auto")
     free = in_process_envs(BREAKOUT, {}, [(3, 0)], "auto")
     seed = np.array([episode_seed(3, 0, 0) % 2**31])
-    theirs = AtariVectorEnv("breakout", 1, max_num_frames_per_episode=40)
+    theirs = AtariVectorEnv("breakout", 1, max_num_frames_per_episode=40, noop_max=31)
     for one in (limited, free):
         one.reset()
     theirs.reset(seed=seed)

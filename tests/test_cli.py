@@ -249,6 +249,7 @@ def test_presets_are_the_published_numbers() -> None:
         "atari",
         "minatar",
         "a2c",
+        "a2c-atari",
         "a2c-mujoco",
     }
 

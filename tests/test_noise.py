@@ -204,7 +204,12 @@ def test_minibatches_come_from_their_groups(streams: list[Stream]) -> None:
 
 def point(at: float, snr: float, coin: float = 0.010) -> dict[str, Any]:
     groups = {
-        name: {"snr": [x, 0, 1], "cosine": [x, 0, 1], "alignment": [1.0, 0.9, 1.1]}
+        name: {
+            "snr": [x, 0, 1],
+            "cosine": [x, 0, 1],
+            "alignment": [1.0, 0.9, 1.1],
+            "variance": [20.0, 19, 21],
+        }
         for name, x in (("kept", 0.02), ("dropped", snr), ("coin", coin), ("shifted", coin))
     }
     difference = {"snr": [snr - coin, 0, 0], "cosine": [snr - coin, 0, 0],
@@ -235,7 +240,7 @@ def test_the_verdict_follows_the_interval_over_members(snrs: tuple, said: str) -
     assert said in verdicts(found)[0]
     assert over_members(found["cells"][0], "groups", "coin", "snr").value == pytest.approx(0.01)
     page = extra(found)
-    assert said in page.html and [len(plot.panels[0].lines) for plot in page.plots] == [4, 4]
+    assert said in page.html and [len(plot.panels[0].lines) for plot in page.plots] == [4, 4, 4]
     assert len(text_table(found)[1]) == len(text_table(found)[0])
 
 

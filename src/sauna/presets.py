@@ -66,6 +66,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "checkpoint_every": 1280,
     },
 }
+PRESETS["a2c-atari"] = {**PRESETS["a2c"], "sign_rewards": True, "normalize_rewards": False}
 PRESETS["a2c-mujoco"] = {**PRESETS["a2c"], "entropy_coef": 0.0, "trunk": "separate"}
 
 # The preset of an algorithm where none is named.
@@ -77,7 +78,8 @@ PRESET_HELP = {
     "flagrun": "PPO on HumanoidFlagrunHarder: 32 actors, 512 steps each, minibatches of 4096",
     "atari": "PPO on Atari as published: Nature CNN, 8 games, signs of rewards",
     "minatar": "PPO on gymnax's MinAtar as PureJaxRL runs it: 64 environments, 64-64 MLPs",
-    "a2c": "A2C as published (Mnih et al. 2016, OpenAI baselines): 16 actors, 5 steps each",
+    "a2c": "A2C's numbers as published (Mnih et al. 2016, baselines): 16 actors, 5 steps each",
+    "a2c-atari": "the same on Atari: signs of rewards, none of them normalised",
     "a2c-mujoco": "the same for continuous control: separate trunks, no entropy bonus",
 }
 

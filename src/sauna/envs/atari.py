@@ -2,14 +2,16 @@
 
 A step is as in Mnih et al. (2015) and OpenAI baselines: an action for four frames, of which the
 last two are seen (the larger of each pixel), grey, 84 x 84, behind the three steps before; a game
-begins with FIRE, where there is one, and up to 30 frames of no-ops. Rewards are the game's own.
+begins with FIRE, where there is one, and no-ops, up to 30 frames in all. Rewards are the game's
+own.
 
 Three things are done here because ale-py (0.12) does them otherwise. A lost life is told as such
 and the game goes on: ale-py's `episodic_life` begins a new game, so that later lives are never
-played. The time limit is counted here: where ale-py truncates, it leaves out the last frame and
-shows one of the step before instead. And a vector environment steps all of its games or none, but
-a filter lets some stand still: so each game is a vector of one with a thread of its own, and a step
-is begun in all of them before the first is waited for.
+played, and its `life_loss_info` makes an end of it. The time limit is counted here: where ale-py
+truncates, it leaves out the last frame and shows one of the step before instead. And a vector
+environment steps all of its games or none, but a filter lets some stand still: so each game is a
+vector of one with a thread of its own, and a step is begun in all of them before the first is
+waited for.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ class AtariEnv(gymnasium.Env):
       game: ale-py's name.
       repeat_action_probability: of sticky actions (Machado et al. 2018 use 0.25).
       full_action_space: all 18 actions, instead of those that the game knows.
-      noop_max: bound of the frames that pass before the first observation.
+      noop_max: most frames that pass before the first observation, FIRE among them.
       use_fire_reset: whether FIRE is pressed first, in games that wait for it.
       episodic_life: whether `info["life_lost"]` tells that a life was lost and the game goes on.
       max_num_frames_per_episode: the time limit, in frames after the first observation.
@@ -96,7 +98,7 @@ class AtariEnv(gymnasium.Env):
         same: dict[str, Any] = {
             "repeat_action_probability": repeat_action_probability,
             "full_action_space": full_action_space,
-            "noop_max": noop_max,
+            "noop_max": noop_max + 1,  # ale-py draws a number below it
             "use_fire_reset": use_fire_reset,
             "frameskip": FRAMES,
             "max_num_frames_per_episode": UNLIMITED,

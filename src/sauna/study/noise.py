@@ -25,10 +25,11 @@ ABOUT = (
     "policy gradient of minibatches of kept steps, of dropped ones, of steps that a coin kept, and "
     "of steps dropped by the filter's decisions moved in time (shifted: as many, and as bunched). "
     "Signal to noise is the squared length of a group's mean gradient over the trace of its "
-    "covariance, for one minibatch. Cosine is that of a minibatch's gradient and of a large "
-    "independent batch of all steps. Alignment is the cosine with endless minibatches: below 1 "
-    "where the group's gradient is biased, not only noisy. In brackets: 95% over members, each the "
-    "mean of its checkpoints; not corrected for the number of comparisons."
+    "covariance, for one minibatch; variance is that trace, as a ratio of two "
+    "groups'. Cosine is that of a minibatch's gradient and of a large independent batch of all "
+    "steps. Alignment is the cosine with endless minibatches: below 1 where the group's gradient "
+    "is biased, not only noisy. In brackets: 95% over members, each the mean of its checkpoints; "
+    "not corrected for the number of comparisons."
 )
 # key in the figures, title, caption, y axis, its limits
 _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
@@ -36,10 +37,13 @@ _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
      "the trace of its covariance.", "signal to noise", None),
     ("cosine", "Cosine to the gradient of a large batch", "Mean cosine of a minibatch's gradient "
      "and that of all steps of an independent large batch.", "cosine", (-1.0, 1.0)),
+    ("variance", "Variance of a minibatch's gradient", "Trace of the group's covariance.",
+     "variance", None),
 )  # fmt: skip
 HEAD = ("Task", "Arm", "Members", "Keep rate", "SNR kept", "SNR coin", "SNR dropped",
         "SNR dropped - coin", "SNR dropped - shifted", "SNR per env step, kept - coin",
-        "Cosine dropped - coin", "Alignment of kept")  # fmt: skip
+        "Variance, dropped / coin", "Variance, kept / coin", "Cosine dropped - coin",
+        "Alignment of kept")  # fmt: skip
 
 
 def extra(measured: Mapping[str, Any]) -> Extra:
@@ -97,6 +101,8 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
             over_members(cell, "differences", "dropped - coin", "snr"),
             over_members(cell, "differences", "dropped - shifted", "snr"),
             over_members(cell, "differences", "kept - coin", "snr_per_env_step"),
+            over_members(cell, "differences", "dropped - coin", "variance_ratio"),
+            over_members(cell, "differences", "kept - coin", "variance_ratio"),
             over_members(cell, "differences", "dropped - coin", "cosine"),
             over_members(cell, "groups", "kept", "alignment"),
         ]
