@@ -16,6 +16,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,9 @@ from sauna.study.units import units_of
 ROOT = Path(__file__).parent.parent
 STUDIES = ("fig3", "cheetah30", "release", "a2c", "minatar", "pong")
 CLAIMED = ("fig3", "cheetah30", "release")  # what the paper's claims are held against
-DRAWN = ("fig3", "minatar", "pong")  # whose curves are pictures in docs/
 MEASURED = {"noise": noise, "dial": dial, "fig5": torso}  # what `docs/why.md` tells
 STILLS = ROOT / "docs" / "why" / "figures" / "stills.png"
+CURVES_OF_RETURNS = "learning_curves"  # the figure's name
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
 POINTS = 30  # of each curve that are committed
 SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8")  # in the README's figure
@@ -185,6 +186,7 @@ def document() -> str:
         summary = summarize(results)
         parts += [f"## {name}", f"`{results['command']}`", arms_table(name, results, summary)]
         parts.append(_missing(name, results))
+        parts.append(shown_figures(name))
         parts.append(_verdicts(summary["verdicts"]))
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -278,15 +280,30 @@ def insert(path: Path, name: str, text: str) -> None:
 
 
 def figures(name: str, results: dict[str, Any]) -> None:
-    """Learning curves (fig3's are the README's picture) of the arms that decide."""
-    chosen = [cell for cell in results["cells"] if cell["label"] in SHOWN]
-    shown = {**results, "cells": chosen}
-    drawn = write_figures(shown, summarize(shown), ROOT / "docs" / name)
-    kept = ["learning_curves.png", *(["keep_rate.png"] if len(chosen) > 1 else [])]
-    for path in (ROOT / "docs" / name / "figures").iterdir():
-        if path.name not in kept:
-            path.unlink()
-    assert drawn
+    """The figures of a study's report, as SVG: a picture that git stores in little room."""
+    place = ROOT / "docs" / name
+    shutil.rmtree(place, ignore_errors=True)
+    write_figures(results, summarize(results), place)
+    for path in (place / "figures").glob("*.png"):
+        path.unlink()
+
+
+def shown_figures(name: str) -> str:
+    """The learning curves, and links to the report's other figures."""
+    found = sorted((ROOT / "docs" / name / "figures").glob("*.svg"))
+    others = [f"[{path.stem.replace('_', ' ')}]({name}/figures/{path.name})" for path in found
+              if path.stem != CURVES_OF_RETURNS]  # fmt: skip
+    return (f"![Learning curves]({name}/figures/{CURVES_OF_RETURNS}.svg)\n\n"
+            f"More figures: {', '.join(others)}.")  # fmt: skip
+
+
+def readmes_picture(results: dict[str, Any]) -> None:
+    """fig3's learning curves of the arms that decide."""
+    shown = {**results, "cells": [cell for cell in results["cells"] if cell["label"] in SHOWN]}
+    with tempfile.TemporaryDirectory() as folder:
+        write_figures(shown, summarize(shown), Path(folder))
+        picture = Path(folder) / "figures" / f"{CURVES_OF_RETURNS}.png"
+        shutil.copy(picture, ROOT / "docs" / picture.name)
 
 
 def pong(results: dict[str, Any]) -> str:
@@ -299,7 +316,7 @@ def pong(results: dict[str, Any]) -> str:
         f"PPO, one seed (`{results['command']}`): the mean training score of the last 100 games is "
         f"{low:.1f} after {early:,} env steps and {high:.1f} after {late:,}."
     )
-    return f"{text}\n\n![Pong, one seed](pong/figures/learning_curves.png)"
+    return f"{text}\n\n![Pong, one seed](pong/figures/learning_curves.svg)"
 
 
 def main() -> None:
@@ -314,12 +331,13 @@ def main() -> None:
             train(name)
         if "--train" in sys.argv or "--collect" in sys.argv:
             collect_measured(name)
-    (ROOT / "docs" / "why.md").write_text(why())
-    (ROOT / "docs" / "results.md").write_text(document())
-    found = {name: results for name in DRAWN if (results := load(name))}
+    found = {name: results for name in STUDIES if (results := load(name))}
     for name, results in found.items():
         figures(name, results)
+    (ROOT / "docs" / "why.md").write_text(why())
+    (ROOT / "docs" / "results.md").write_text(document())
     if "fig3" in found:
+        readmes_picture(found["fig3"])
         insert(ROOT / "README.md", "ppo", ppo_table(found["fig3"]))
     for name in ("fig3", "cheetah30"):
         if results := load(name):
