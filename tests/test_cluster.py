@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -392,3 +393,33 @@ def test_a_failing_seed_is_reported_and_the_others_complete(place: Place) -> Non
         assert [m["status"] for m in cell["members"]] == ["complete", "failed"]
     assert "out of luck" in results["cells"][0]["members"][1]["error"]
     assert "drop rates" in results["cells"][1]["members"][1]["error"]
+
+
+@slow
+@needs_ray
+def test_through_rays_client(place: Place, local: Path) -> None:
+    """`ray://HOST:PORT`: the study is no part of the cluster; the bytes are the same."""
+    (place.path / "mine.toml").write_text(STUDY.format(steps=STEPS))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    ray = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--port=0"]
+    server = subprocess.Popen(
+        [*ray, "--node-ip-address=127.0.0.1", f"--ray-client-server-port={port}", "--num-cpus=2",
+         "--include-dashboard=false"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        address = f"--address=ray://127.0.0.1:{port}"
+
+        def answers() -> bool:
+            with socket.socket() as asked:
+                return asked.connect_ex(("127.0.0.1", port)) == 0
+
+        until(answers)
+        place.finish(place.start("--processes=4", "--on=ray", address, folder="client"))
+        assert server.poll() is None, "the cluster is not ours to end"
+    finally:
+        server.terminate()
+        server.wait(60)
+    same(place.path / "client/runs", local)
+    until(lambda: not place.processes(), 60)
