@@ -176,6 +176,7 @@ def document() -> str:
         f"which is too narrow with six seeds: it holds the truth {covered:.0%} of the time rather "
         "than 95% (normal scores, `python results/intervals.py`). The area under the curve is that "
         "of the budget's env steps, 10^6, also where an arm takes more of them.",
+        _revisions(),
         *_claims(),
     ]
     for name in STUDIES:
@@ -200,6 +201,22 @@ def _verdicts(found: list[dict[str, Any]]) -> str:
     return (
         f"Of {len(found)} comparisons, {len(decided)} are decided.\n\n{_listed(decided)}\n\n"
         f"<details><summary>The other {len(others)}</summary>\n\n{_listed(others)}\n\n</details>"
+    )
+
+
+def _revisions() -> str:
+    """Whether runs of several revisions of the package can be compared."""
+    path = ROOT / "results" / "revisions.json"
+    if not path.exists():
+        return ""
+    stored = json.loads(path.read_text())
+    runs = stored["runs"]
+    revisions = len({run["revision"] for run in runs})
+    rows, equal = (sum(run[key] for run in runs) for key in ("rows", "equal"))
+    return (
+        f"The runs were trained by {revisions} revisions of the package, while it was made. Of every "
+        f"study, arm and revision one run was begun again at revision {stored['now'][:7]}: {equal} "
+        f"of {rows} rows of metrics came out with the same bits (`{stored['command']}`)."
     )
 
 
