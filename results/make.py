@@ -214,9 +214,9 @@ def _revisions() -> str:
     revisions = len({run["revision"] for run in runs})
     rows, equal = (sum(run[key] for run in runs) for key in ("rows", "equal"))
     return (
-        f"The runs were trained by {revisions} revisions of the package, while it was made. Of every "
-        f"study, arm and revision one run was begun again at revision {stored['now'][:7]}: {equal} "
-        f"of {rows} rows of metrics came out with the same bits (`{stored['command']}`)."
+        f"The runs were trained by {revisions} revisions of the package, while it was made. Of "
+        f"every study, arm and revision one run was begun again at revision {stored['now'][:7]}: "
+        f"{equal} of {rows} rows of metrics came out with the same bits (`{stored['command']}`)."
     )
 
 
