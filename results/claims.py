@@ -20,7 +20,6 @@ from sauna.study.tables import PAPER, unversioned
 
 VARIANTS = ("sauna", "sauna 0.8", "sauna-paper")
 REFERENCES = ("sauna-reference", "sauna-reference, kept steps")
-IDLE = " (where it drops next to nothing)"
 
 
 class Claim(NamedTuple):
@@ -113,20 +112,22 @@ def _judged(
 ) -> list[str]:
     """`filters`: whether the arm drops steps at all, so that it could get credit for it."""
     found = compare(pairs)
-    idle = [filters and rate >= UNFILTERED for rate in keep_rates]
     better, worse = (
-        [unversioned(task) + IDLE * (nothing and not all(idle))
-         for (task, c), nothing in zip(found.items(), idle, strict=True) if c.kind == kind]
+        [unversioned(task) for task, c in found.items() if c.kind == kind]
         for kind in ("better", "worse")
-    )  # fmt: skip
+    )
+    idle = [unversioned(task) for task, rate in zip(found, keep_rates, strict=True)
+            if filters and rate >= UNFILTERED]  # fmt: skip
     (over, *others) = (c.improvement for c in found.values())
     if others:
         over = improvement_over_tasks(list(pairs.values()))
     so = _conclusion(better, worse, len(pairs))
     if others:
         so += _over(over)
-    if all(idle):
+    if len(idle) == len(found):
         so += "; it drops next to nothing"
+    elif won := [task for task in better if task in idle]:
+        so += f"; it drops next to nothing on {', '.join(won)}"
     low, high = f"{min(keep_rates):.3f}", f"{max(keep_rates):.3f}"
     kept = low if low == high else f"{low} to {high}"
     return [str(len(pairs)), interval(over, 2), kept, so]

@@ -58,8 +58,17 @@ PUBLISHED = {
 
 
 def train(name: str) -> None:
+    """Trains and measures what is missing; what fails is told, and stands in the results.
+
+    Raises:
+      SystemExit: it was interrupted.
+    """
     command = [sys.executable, "-m", "sauna", "study", name, "--out", "runs"]
-    subprocess.run(command, check=True)
+    code = subprocess.run(command).returncode
+    if code in (130, 143) or code < 0:
+        sys.exit(code)
+    if code:
+        print(f"{name}: exit code {code}", flush=True)
 
 
 def collect(name: str) -> None:
@@ -175,7 +184,7 @@ def document() -> str:
         "not corrected for the number of tasks. The interval of an IQM is a percentile bootstrap, "
         f"which is too narrow with six seeds: it holds the truth {covered:.0%} of the time rather "
         "than 95% (normal scores, `python results/intervals.py`). The area under the curve is that "
-        "of the budget's env steps, 10^6, also where an arm takes more of them.",
+        "of the budget's env steps, also where an arm takes more of them.",
         _revisions(),
         *_claims(),
     ]
@@ -212,11 +221,12 @@ def _revisions() -> str:
     stored = json.loads(path.read_text())
     runs = stored["runs"]
     revisions = len({run["revision"] for run in runs})
-    rows, equal = (sum(run[key] for run in runs) for key in ("rows", "equal"))
+    equal = sum(run["rows"] == run["equal"] for run in runs)
     return (
         f"The runs were trained by {revisions} revisions of the package, while it was made. Of "
-        f"every study, arm and revision one run was begun again at revision {stored['now'][:7]}: "
-        f"{equal} of {rows} rows of metrics came out with the same bits (`{stored['command']}`)."
+        f"every study, arm and revision one run was begun again by revision {stored['now']}: the "
+        f"first {stored['iterations']} iterations of {equal} of {len(runs)} came out with the same "
+        f"bits (`{stored['command']}`)."
     )
 
 

@@ -73,6 +73,9 @@ def test_it_holds_on_the_papers_tasks_and_on_no_fewer() -> None:
     cells += [cell(task, "sauna", HIGH, 0.8) for task in PAPER]
     results = {"settings": {"seeds": 6}, "cells": cells}
     assert said(results)["so"] == "holds; better over the tasks by the interval"
+    for member in results["cells"][-1]["members"]:
+        member["keep_rate"] = 1.0
+    assert said(results)["so"].endswith("; it drops next to nothing on Swimmer")
 
 
 @pytest.mark.parametrize("keep_rate", [0.995, 1.0])
@@ -87,7 +90,7 @@ def test_no_credit_where_it_filtered_nothing_on_the_task_it_won() -> None:
     for member in results["cells"][3]["members"]:
         member["keep_rate"] = 1.0
     assert said(results)["so"] == (
-        "better on A (where it drops next to nothing), not decided on the other 2"
+        "better on A, not decided on the other 2; it drops next to nothing on A"
     )
 
 

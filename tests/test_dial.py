@@ -16,7 +16,7 @@ from helpers import environment
 from sauna.errors import BadInput
 from sauna.measure.coverage import particle_entropy
 from sauna.study.dial import correlation, extra, marks, text_table, verdicts
-from sauna.study.measuring import ALONG
+from sauna.study.measuring import ALONG, Item, scale_of
 from sauna.study.spec import load_spec, read_spec
 
 
@@ -101,12 +101,31 @@ def test_what_is_the_same_for_all_follows_nothing() -> None:
     assert "moves exploration, with no evidence that return follows" in told
 
 
+def test_the_scale_is_the_baselines_first_seed_or_none() -> None:
+    spec = read_spec({"tasks": ["A-v0"], "seeds": [4, 2], "arms": [{"label": "sauna"}]})
+
+    def item(seed: int) -> Item:
+        return Item("A-v0", "sauna", "sauna", seed, Path("run"), [0.5, 1.0], [3, 7], [])
+
+    assert scale_of(spec, [item(2), item(4)], "A-v0") == {
+        "run": "run", "member": "sauna/4", "iteration": 7}  # fmt: skip
+    assert scale_of(spec, [item(2)], "A-v0") is None
+
+
 def test_the_scale_needs_a_normaliser() -> None:
     spec = {"tasks": ["A-v0"], "arms": [{"label": "sauna"}], "measure": "dial",
             "checkpoint_every": 10, "keep_checkpoints": 1000}  # fmt: skip
     assert read_spec(spec).measure == "dial"
     with pytest.raises(BadInput, match="normalize_observations: dial"):
         read_spec({**spec, "normalize_observations": False})
+    with pytest.raises(BadInput, match="needs 'sauna' on B-v0, too"):
+        own = {"label": "x", "arm": "sauna", "tasks": ["B-v0"], "baseline": "x2"}
+        other = {"label": "x2", "arm": "sauna", "tasks": ["B-v0"], "baseline": "x"}
+        read_spec({**spec, "arms": [{"label": "sauna"}, own, other]})
+    with pytest.raises(BadInput, match="not of random-drop"):
+        read_spec(
+            {**spec, "arms": [{"label": "sauna"}, {"label": "random-drop", "drop_rate": 0.1}]}
+        )
     with pytest.raises(BadInput, match="not of ppo"):
         read_spec({**spec, "arms": [{"label": "sauna"}, {"label": "ppo"}]})
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 from sauna import rundir
 from sauna.study.schedule import Executor
-from sauna.study.spec import read_spec
+from sauna.study.spec import check, read_spec
 from sauna.study.units import Unit, units_of
-from sauna.study.view import DONE, FAILED, WAITING, StudyView
+from sauna.study.view import DONE, FAILED, WAITING, Cell, StudyView
 
 TWO = {"tasks": ["A-v0"], "seeds": 3, "steps": 10_000, "rollout_steps": 1000, "minibatches": 10,
        "arms": [{"label": "ppo"}, {"label": "sauna"}]}  # fmt: skip
@@ -64,21 +65,69 @@ def test_one_that_crashed_once_is_continued_and_not_split(tmp_path: Path) -> Non
     assert executor.starts[ppo.name] == 2 and not list(tmp_path.rglob("split.json"))
 
 
+def test_two_labels_of_the_same_settings_are_one_unit(tmp_path: Path) -> None:
+    arms = [{"label": "ppo"}, {"label": "again", "arm": "ppo"}]
+    executor, (one, other) = run(tmp_path, {**TWO, "arms": arms})
+    assert one.name == other.name and executor.starts[one.name] == 2
+    assert [executor.starts[f"{one.name}/seed-{seed}"] for seed in range(3)] == [1, 1, 1]
+
+
+ROW = {"kept_steps": 0, "return_mean": 7.0, "keep_rate": 1.0}
+
+
 def test_a_mark_for_each_seed(tmp_path: Path, capsys) -> None:
     spec = read_spec(TWO)
     units = units_of(spec, 3)
     view = StudyView(spec, units, tmp_path)
-    row = {"env_steps": 5000, "kept_steps": 5000, "return_mean": 7.0, "keep_rate": 1.0}
-    view.progress(units[0], {"rows": [{**row, "seed": 0}]})
+    view.started(units[0])
+    view.progress(units[0], {"rows": [{**ROW, "seed": 0, "env_steps": 5000}]})
     view.ended(units[0]._replace(seeds=(1,)), "out of luck")
     view.refresh()
     told = capsys.readouterr().out
     assert f"ppo on A-v0 \u2585{FAILED}{WAITING} return 7.0, keep rate 1.000" in told
     assert "FAILED: A-v0, ppo, seed 1: out of luck" in told and "25.0% of 6 members" in told
-    view.progress(units[0], {"rows": [{**row, "env_steps": 10_000, "seed": 0}]})
-    assert "33.3%" in view._status() and not view._cells["ppo", "A-v0"].is_running()
+    view.progress(units[0], {"rows": [{**ROW, "seed": 0, "env_steps": 10_000}]})
+    assert "33.3%" in view._status()
+    view.stopped(units[0])
+    assert view._named() == ""
     view.ended(units[0]._replace(seeds=(0,)), None)
     assert view._cells["ppo", "A-v0"].marks() == DONE + FAILED + WAITING
+
+
+def test_the_rate_is_that_of_late(monkeypatch) -> None:
+    """What came before a pause, and what is trained once more after a failure, is left out."""
+    cell, now = Cell(check(read_spec(TWO).arms[0], "A-v0")), [0.0]
+    monkeypatch.setattr("sauna.study.view.time.monotonic", lambda: now[0])
+    cell.running.add("unit")
+
+    def trained(at: float, steps: int) -> None:
+        now[0] = at
+        cell.note({**ROW, "seed": 0, "env_steps": steps}, trained=True)
+
+    trained(0, 1000)
+    assert cell.rate() is None
+    trained(10, 3000)
+    assert cell.rate() == 200
+    trained(1000, 4000)
+    trained(1010, 5000)
+    assert cell.rate() == 100
+    trained(1020, 1000)
+    trained(1030, 1500)
+    assert cell.rate() == 50
+    cell.running.clear()
+    assert cell.rate() is None
+
+
+def test_on_a_small_terminal_only_what_trains_is_shown(tmp_path: Path) -> None:
+    spec = read_spec({**TWO, "tasks": [f"{letter}-v0" for letter in "ABCDEFGH"]})
+    units = units_of(spec, 3)
+    view = StudyView(spec, units, tmp_path)
+    view._live = SimpleNamespace(console=SimpleNamespace(height=15))
+    view.started(units[3])
+    shown = view._table()
+    assert shown.row_count == 1 and shown.caption == "15 more lines are complete or waiting"
+    assert view._table(whole=True).row_count == 16
+    view._live = None
 
 
 def test_a_quiet_view_says_nothing(tmp_path: Path, capsys) -> None:

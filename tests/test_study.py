@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
 import signal
@@ -12,7 +13,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete
 
 from helpers import SMALL, environment
 from sauna import rundir
@@ -20,8 +23,10 @@ from sauna.api import compare
 from sauna.config import parse
 from sauna.errors import BadInput
 from sauna.presets import ARMS, COMPARED
-from sauna.study.command import compare_command, comparison
+from sauna.spaces import describe
+from sauna.study.command import _check_measurable, compare_command, comparison
 from sauna.study.process import UnitProcess
+from sauna.study.results import _ended
 from sauna.study.spec import built_in, check, load_spec, read_spec
 from sauna.study.summary import summarize
 from sauna.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
@@ -88,6 +93,43 @@ def test_beside_the_reference_all_arms_take_its_rules() -> None:
     configs = [check(arm, "A-v0") for arm in spec.arms]
     assert {c.truncation for c in configs} == {"terminate"}
     assert {c.budget for c in configs} == {"env"}
+
+
+def test_a_coin_beside_a_masked_arm(tmp_path) -> None:
+    """What one of the copied rules is read with comes along."""
+    arms = [{"label": "sauna-reference", "dropped": "mask"}, {"label": "random-drop"}]
+    coin = check(read_spec({**TWO, "arms": arms, "baseline": "sauna-reference"}).arms[1], "A-v0")
+    assert (coin.dropped, coin.gae_over) == ("mask", "kept")
+
+
+@pytest.mark.parametrize(
+    "given, advice",
+    [({}, (5, 98)), ({"algorithm": "a2c"}, (125, 100)), ({"checkpoint_every": 1}, (1, 489))],
+)
+def test_the_advice_about_checkpoints_can_be_taken(given: dict, advice: tuple) -> None:
+    text = {**TWO, "arms": [{"label": "sauna"}], "measure": "noise", **given}
+    with pytest.raises(BadInput, match="checkpoint_every = {} and keep_checkpoints = {}$".format(
+            *advice)):  # fmt: skip
+        read_spec(text)
+    every, kept = advice
+    assert read_spec({**text, "checkpoint_every": every, "keep_checkpoints": kept}).measure
+
+
+def test_pictures_are_not_measured() -> None:
+    config = check(read_spec(TWO).arms[1], "A-v0")
+    spaces = describe(Box(0, 255, (84, 84, 4), np.uint8), Discrete(3))
+    for measure, changed in (("noise", {}), ("dial", {"normalize_observations": False})):
+        spec = read_spec(TWO)._replace(measure=measure)
+        with pytest.raises(BadInput, match=f"measure: {measure}"):
+            _check_measurable(spec, dataclasses.replace(config, **changed), spaces)
+    _check_measurable(read_spec(TWO)._replace(measure="dial"), config, spaces)
+
+
+def test_the_area_is_that_of_the_budget() -> None:
+    rows = [{"env_steps": n, "return_mean": float(n)} for n in (100, 200, 300, 400)]
+    assert _ended(rows, 300)["area"] == 200.0
+    assert _ended(rows, 400)["area"] == 250.0
+    assert _ended([], 400)["area"] is None
 
 
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
@@ -351,6 +393,14 @@ def test_a_second_study_in_the_same_place_is_refused(tmp_path: Path) -> None:
         done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
     assert done.returncode == 2 and "is in use by process" in done.stderr
     assert {path.name for path in tmp_path.rglob("*")} == {"units", ".lock"}
+
+
+def test_where_a_file_is_in_the_way_nothing_is_made(tmp_path: Path) -> None:
+    spec = comparison("worlds:Scripted", COMPARED, {"seeds": 4, **QUICK})
+    (tmp_path / spec.name).write_text("")
+    with pytest.raises(BadInput, match="is no folder"):
+        compare("worlds:Scripted", out=tmp_path, seeds=4, quiet=True, **QUICK)
+    assert [path.name for path in tmp_path.iterdir()] == [spec.name]
 
 
 def test_lines_that_are_no_messages_are_passed_over(tmp_path: Path, monkeypatch) -> None:

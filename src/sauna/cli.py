@@ -282,8 +282,8 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
     if number := summary.get("not_measured"):
         log = Path(out) / spec.name / spec.measure / "stderr.txt"
-        raise SaunaError(f"{number} members could not be measured; {log} says why, and running "
-                         f"again tries them again")  # fmt: skip
+        raise SaunaError(f"{number} members are not measured; what is said above, and {log}, say "
+                         f"why")  # fmt: skip
 
 
 def _bench(values: dict[str, Any]) -> None:

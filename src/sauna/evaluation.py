@@ -167,7 +167,7 @@ def not_drawn(error: Exception) -> str:
     text = str(error) if isinstance(error, SaunaError) else one_line(error)
     missing = any(word in text for word in ("GL", "Mesa", "isplay"))
     help = "; without a display MuJoCo needs libegl1 or libosmesa6" * missing
-    return f"it cannot be drawn here: {text}{help}"
+    return f"the environment cannot be drawn here: {text}{help}"
 
 
 def choose_renderer() -> None:

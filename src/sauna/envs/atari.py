@@ -68,7 +68,8 @@ class AtariEnv(gymnasium.Env):
       game: ale-py's name.
       repeat_action_probability: of sticky actions (Machado et al. 2018 use 0.25).
       full_action_space: all 18 actions, instead of those that the game knows.
-      noop_max: most frames that pass before the first observation, FIRE among them.
+      noop_max: most frames that pass before the first observation, FIRE among them (which passes
+        also where this is 0).
       use_fire_reset: whether FIRE is pressed first, in games that wait for it.
       episodic_life: whether `info["life_lost"]` tells that a life was lost and the game goes on.
       max_num_frames_per_episode: the time limit, in frames after the first observation.

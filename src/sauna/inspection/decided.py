@@ -32,7 +32,8 @@ from sauna.selection.filters import (
 class Decisions(NamedTuple):
     """Of one environment's `L` env steps.
 
-    Median and edge are NaN where there are no earlier predictions, and for a user's own filter.
+    Median and edge are NaN where there are no earlier predictions, and for other filters than
+    `sauna`. An edge is infinite where a held keep rate drops whatever comes.
     """
 
     prediction: np.ndarray  # [L] x of eq. 7: the head's Vex, for a joint decision its mean
@@ -61,7 +62,7 @@ def standards(config: Config, state: Any, hypers: Hypers) -> tuple[Array, Array]
     edge = hypers.threshold * (jnp.abs(middle) + EPSILON)
     if isinstance(state, Held):
         least = held_edge(state, config.keep_rate_target)
-        edge = jnp.where(jnp.isposinf(least), jnp.nan, jnp.maximum(least, 0.0))
+        edge = jnp.maximum(least, 0.0)
     known = history.number > 0
     return tuple(jnp.atleast_1d(jnp.where(known, x, jnp.nan)) for x in (middle, edge))  # type: ignore[return-value]
 

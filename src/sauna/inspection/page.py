@@ -77,7 +77,9 @@ def page_data(found: Inspection) -> dict[str, Any]:
         vex = {"vex": ("Vex", decisions.prediction.astype(float))}
         if compares(found):
             middle = "running median" + " of |Vex|" * (config.keep_rate_target > 0)
-            vex |= {"median": (middle, decisions.median), "edge": ("dropped below", decisions.edge)}
+            highest = 1.1 * np.abs(decisions.prediction).max()  # an edge may be infinite
+            edge = np.minimum(decisions.edge, highest)
+            vex |= {"median": (middle, decisions.median), "edge": ("dropped below", edge)}
             panels[0] |= {"lines": ["vex", "median"], "band": "edge"}
         lines = vex | lines
     return {
@@ -158,7 +160,7 @@ def states(found: Inspection) -> str:
 
 def _thinned(found: Inspection) -> str:
     every = pixel_stride(found.played.observation)
-    return f", of every {every}th row and column of pixels" if every > 1 else ""
+    return f", of one row and column of pixels in {every}" if every > 1 else ""
 
 
 def meaning(found: Inspection) -> str:

@@ -54,7 +54,7 @@ class Pictures:
         try:
             drawn = self._env.render()
             if drawn is None:
-                raise SaunaError("the environment gives none (render_mode rgb_array)")
+                raise SaunaError("it gives no picture (render_mode rgb_array)")
             self.taken.append((row, _encoded(drawn)))
         except Exception as error:  # renderers fail in every way there is
             self._say(f"no pictures: {not_drawn(error)}")

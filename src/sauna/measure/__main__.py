@@ -54,6 +54,7 @@ def main() -> int:
         measure(given)
     except SaunaError as error:
         print(json.dumps({"error": str(error)}), flush=True)
+        print(error, file=sys.stderr)
         return 1
     return 0
 

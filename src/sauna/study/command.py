@@ -103,7 +103,8 @@ def study(
       the summary.
 
     Raises:
-      BadInput: an environment, or the cluster, cannot be used.
+      BadInput: an environment, the cluster or the folder cannot be used, another study works there,
+        or another of this name did.
       Interrupted: a signal came; running again continues.
     """
     if jobs < 0:
@@ -225,6 +226,8 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
       BadInput: the folder holds another study of this name.
     """
     path = place / "study.json"
+    if place.exists() and not place.is_dir():
+        raise BadInput(f"out: {place} is no folder")
     if path.is_file():
         stored = json.loads(path.read_text())
         if not _is_same(stored["study"], spec):
@@ -292,7 +295,7 @@ def _row(row: Mapping[str, Any]) -> list[str]:
     return [
         row["task"], row["label"], f"{row['seeds']}{failed}", interval(row["final_iqm"], digits),
         interval(row["area_iqm"], digits), f"{mean} +- {std}", number(row["keep_rate"], 3),
-        number(row["env_steps"], 0), interval(row["improvement"], 2),
+        f"{row['env_steps'] or 0:,.0f}", interval(row["improvement"], 2),
     ]  # fmt: skip
 
 

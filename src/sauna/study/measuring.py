@@ -106,7 +106,7 @@ def measure(
 ) -> None:
     """Makes what is missing of a study's measurements, `jobs` members at a time on this machine.
 
-    A member whose measurement fails is told and left out; running the study again tries it again.
+    A member whose measurement fails is told and left out; the study, run again, tries it again.
     """
     items = list(items_of(spec, units, folder, place))
     scales = {}

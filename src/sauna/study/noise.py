@@ -15,6 +15,7 @@ import numpy as np
 
 from sauna import style
 from sauna.study.figures import Extra, Line, Panel, Plot
+from sauna.study.numbers import interval
 from sauna.study.statistics import Estimate, mean_interval
 from sauna.study.tables import table
 
@@ -25,8 +26,8 @@ ABOUT = (
     "policy gradient of minibatches of kept steps, of dropped ones, of steps that a coin kept, and "
     "of steps dropped by the filter's decisions moved in time (shifted: as many, and as bunched). "
     "Signal to noise is the squared length of a group's mean gradient over the trace of its "
-    "covariance, for one minibatch; variance is that trace, as a ratio of two "
-    "groups'. Cosine is that of a minibatch's gradient and of a large independent batch of all "
+    "covariance, for one minibatch; variance is that trace, in the table one group's over "
+    "another's. Cosine is that of a minibatch's gradient and of a large independent batch of all "
     "steps. Alignment is the cosine with endless minibatches: below 1 where the group's gradient "
     "is biased, not only noisy. In brackets: 95% over members, each the mean of its checkpoints; "
     "not corrected for the number of comparisons."
@@ -42,8 +43,8 @@ _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
 )  # fmt: skip
 HEAD = ("Task", "Arm", "Members", "Keep rate", "SNR kept", "SNR coin", "SNR dropped",
         "SNR dropped - coin", "SNR dropped - shifted", "SNR per env step, kept - coin",
-        "Variance, dropped / coin", "Variance, kept / coin", "Cosine dropped - coin",
-        "Alignment of kept")  # fmt: skip
+        "Cosine dropped - coin", "Alignment of kept", "Variance, dropped / coin",
+        "Variance, kept / coin")  # fmt: skip
 
 
 def extra(measured: Mapping[str, Any]) -> Extra:
@@ -101,14 +102,16 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
             over_members(cell, "differences", "dropped - coin", "snr"),
             over_members(cell, "differences", "dropped - shifted", "snr"),
             over_members(cell, "differences", "kept - coin", "snr_per_env_step"),
-            over_members(cell, "differences", "dropped - coin", "variance_ratio"),
-            over_members(cell, "differences", "kept - coin", "variance_ratio"),
             over_members(cell, "differences", "dropped - coin", "cosine"),
             over_members(cell, "groups", "kept", "alignment"),
         ]
+        ratios = [
+            interval(over_members(cell, "differences", pair, "variance_ratio"), 3)
+            for pair in ("dropped - coin", "kept - coin")
+        ]
         rate = f"{np.mean(rates):.2f}" if rates else "-"
         rows.append([cell["task"], cell["label"], f"{used} of {len(cell['members'])}", rate,
-                     *map(shown, values)])  # fmt: skip
+                     *map(shown, values), *ratios])  # fmt: skip
     return rows
 
 
@@ -159,7 +162,7 @@ def _verdict(cell: Mapping[str, Any]) -> str:
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """Signal to noise and cosine of each group along training, a panel for each task and arm."""
+    """Each group along training, a panel for each task and arm."""
     cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
     found = []
     for key, title, caption, label, limits in _PLOTS:

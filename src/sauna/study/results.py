@@ -39,12 +39,12 @@ def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[st
         "metric": METRIC,
         "baseline": spec.baseline,
         "settings": top,
-        **made_with(units, folder),
+        **_made_with(units, folder),
         "cells": cells,
     }
 
 
-def made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
+def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
     """Versions and machines of the runs; each difference is listed."""
     found: dict[str, list[Any]] = {"versions": [], "machine": [], "git": []}
     for unit in units:
@@ -73,7 +73,7 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
         "preset": config["preset"],
         "config": config,
         "command": f"sauna train {shlex.quote(task)} {text}",
-        "git": made_with(units, folder)["git"],
+        "git": _made_with(units, folder)["git"],
         "members": sorted(members, key=lambda member: arm.seeds.index(member["seed"])),
     }
 

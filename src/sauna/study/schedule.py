@@ -16,7 +16,9 @@ ATTEMPTS = 2  # a failed unit is continued once
 class View(Protocol):
     """Where the progress of units is shown."""
 
+    def started(self, unit: Unit) -> None: ...
     def progress(self, unit: Unit, message: dict[str, Any]) -> None: ...
+    def stopped(self, unit: Unit) -> None: ...
     def ended(self, unit: Unit, error: str | None) -> None: ...
     def refresh(self) -> None: ...
 
@@ -97,6 +99,7 @@ class Executor(ABC):
             elif unit.source is None or self._is_ready(unit.source):
                 waiting.remove(unit)
                 self._running[unit.name] = unit
+                self._view.started(unit)
                 self._start(unit)
 
     def _is_ready(self, source: str) -> bool:
@@ -108,6 +111,7 @@ class Executor(ABC):
     def _end(self, name: str, error: str) -> None:
         """A unit is no longer running; `error` says why, if it is not complete."""
         unit = self._running.pop(name)
+        self._view.stopped(unit)
         if unit.is_complete(self._folder):
             self._view.ended(unit, None)
         elif not self._stopping():
@@ -123,10 +127,12 @@ class Executor(ABC):
                 self._give_up(unit, error)
 
     def _split(self, unit: Unit) -> None:
+        """Its seeds wait in its place; another label's unit of the same settings goes with it."""
         waiting = self._waiting
         mark_split(unit, self._folder)
         place = waiting.index(unit) if unit in waiting else 0
-        waiting[place : place + (unit in waiting)] = split(unit, self._folder)
+        waiting[place:place] = split(unit, self._folder)
+        waiting[:] = [other for other in waiting if other.name != unit.name]
 
     def _give_up(self, unit: Unit, error: str) -> None:
         (self._folder / unit.name).mkdir(parents=True, exist_ok=True)

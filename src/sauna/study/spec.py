@@ -104,6 +104,10 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
     configs = [check(arm, task) for arm in arms for task in arm.tasks]
     if spec.measure is not None:
         _check_measure(spec.measure, configs)
+    if spec.measure == "dial":  # whose scale is the baseline's
+        scaled = next(arm.tasks for arm in arms if arm.label == baseline)
+        if missing := set(spec.tasks) - set(scaled):
+            raise BadInput(f"study: dial needs {baseline!r} on {', '.join(sorted(missing))}, too")
     return spec
 
 
@@ -165,9 +169,10 @@ def _check_measure(measure: Any, configs: list[Config]) -> None:
                            f"{-(-config.steps // (every * rollout))}")  # fmt: skip
         if config.backend == "device":
             raise BadInput("backend: measure needs environments on the host")
-        if measure == "dial" and config.filter not in ("sauna", "random-drop"):
-            raise BadInput('study: measure = "dial" is of arms that have a threshold, and coins '
-                           f"beside them, not of {', '.join(config.arm)}")  # fmt: skip
+        coin = config.filter == "random-drop" and config.drop_rate_from
+        if measure == "dial" and config.filter != "sauna" and not coin:
+            raise BadInput('study: measure = "dial" is of arms that have a threshold, and of coins '
+                           f"that repeat their rates, not of {', '.join(config.arm)}")  # fmt: skip
         if measure == "torso" and not config.env.startswith("HalfCheetah"):
             raise BadInput(f'study: measure = "torso" is of HalfCheetah, not of {config.env}')
         if measure == "dial" and not config.normalize_observations:
@@ -219,10 +224,11 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
 def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
     """The rules of a filtered arm that a coin which repeats its drop rates has to share."""
     theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, coin))
+    rules = {name: theirs[name] for name in SHARED_RULES if name not in FIXED[coin.arm]}
     return {
         name: theirs[name]
-        for name in SHARED_RULES
-        if theirs[name] != own[name] and reads(coin.arm, coin.settings, name)
+        for name in rules
+        if theirs[name] != own[name] and reads(coin.arm, {**coin.settings, **rules}, name)
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from sauna.study.units import Unit, parts
 PLAIN_SECONDS = 30.0  # between two progress lines where there is no terminal
 LIVE_SECONDS = 0.25
 NAMED = 4  # arms that a progress line names
+RATE_SECONDS = 60.0  # over which env steps per second are told
 BARS = "▁▂▃▄▅▆▇█"
 WAITING, DONE, FAILED = "·", "✓", "✗"
 
@@ -28,20 +30,22 @@ class Cell:
         self.latest: dict[int, dict[str, Any]] = {}  # seed -> its last row
         self.complete: set[int] = set()
         self.failed: set[int] = set()
+        self.running: set[str] = set()  # names of units
         self._budget = f"{config.budget}_steps"
         batch = config.rollout_steps * config.envs
         self._usable = config.steps // batch * batch
-        self._since: tuple[float, int] | None = None  # when training was first heard of, and where
-        self._last = (0.0, 0)
+        self._recent: deque[tuple[float, int]] = deque()  # when rows came, env steps of all seeds
 
     def note(self, row: dict[str, Any], trained: bool) -> None:
         """A seed's newest row; `trained` unless it is only told again by a run that continues."""
         self.latest[row["seed"]] = row
-        steps = sum(row["env_steps"] for row in self.latest.values())
+        steps, now = sum(row["env_steps"] for row in self.latest.values()), time.monotonic()
+        if not trained or (self._recent and steps < self._recent[-1][1]):
+            self._recent.clear()
         if trained:
-            self._last = (time.monotonic(), steps)
-        if self._since is None or not trained:
-            self._since = (time.monotonic(), steps)
+            self._recent.append((now, steps))
+        while self._recent and now - self._recent[0][0] > RATE_SECONDS:
+            self._recent.popleft()
 
     def share(self, seed: int) -> float:
         """How much of what it can use of its budget a seed has used; 1 once it has ended."""
@@ -49,9 +53,6 @@ class Cell:
             return 1.0
         row = self.latest.get(seed)
         return min(row[self._budget] / max(self._usable, 1), 1.0) if row else 0.0
-
-    def is_running(self) -> bool:
-        return any(seed in self.latest and self.share(seed) < 1 for seed in self.seeds)
 
     def marks(self) -> str:
         """A character for each seed: waiting, a bar as high as its progress, complete, failed."""
@@ -72,10 +73,11 @@ class Cell:
         return sum(values) / len(values) if values else None
 
     def rate(self) -> float | None:
-        """Env steps per second, since training was first heard of."""
-        if self._since is None or not self.is_running() or self._last[0] <= self._since[0]:
+        """Env steps per second of late."""
+        if not self.running or len(self._recent) < 2:
             return None
-        return (self._last[1] - self._since[1]) / (self._last[0] - self._since[0])
+        (first, before), (last, after) = self._recent[0], self._recent[-1]
+        return (after - before) / (last - first) if last > first else None
 
 
 class StudyView:
@@ -119,9 +121,17 @@ class StudyView:
 
     def close(self) -> None:
         if self._live is not None:
-            self._live.update(self._table(), refresh=True)
+            self._live.update(self._table(whole=True), refresh=True)
             self._live.stop()
             self._live = None
+
+    def started(self, unit: Unit) -> None:
+        for cell in self._served(unit):
+            cell.running.add(unit.name)
+
+    def stopped(self, unit: Unit) -> None:
+        for cell in self._served(unit):
+            cell.running.discard(unit.name)
 
     def progress(self, unit: Unit, message: dict[str, Any]) -> None:
         for cell in self._served(unit):
@@ -174,7 +184,7 @@ class StudyView:
 
     def _named(self) -> str:
         """The arms in training, as text."""
-        running = [(key, cell) for key, cell in self._cells.items() if cell.is_running()]
+        running = [(key, cell) for key, cell in self._cells.items() if cell.running]
         told = "".join(
             f"; {label} on {task} {cell.marks()} return {_number(cell.mean('return_mean'), 1)}, "
             f"keep rate {_number(cell.mean('keep_rate'), 3)}"
@@ -182,12 +192,14 @@ class StudyView:
         )
         return told + (f"; {len(running) - NAMED} more" if len(running) > NAMED else "")
 
-    def _table(self) -> Any:
+    def _table(self, whole: bool = False) -> Any:
+        """Every arm on every task, or, where they are too many for the terminal, those in training
+        (all the same if `whole`)."""
         from rich.table import Table
 
         shown = self._cells
-        if self._live is not None and len(shown) > self._live.console.height - 4:
-            shown = {key: cell for key, cell in shown.items() if cell.is_running()}
+        if not whole and len(shown) > self._live.console.height - 4:
+            shown = {key: cell for key, cell in shown.items() if cell.running}
         table = Table(title=self._status(), title_justify="left", box=None)
         for column in ("task", "arm", "seeds"):
             table.add_column(column)
