@@ -53,6 +53,8 @@ ALLOWED = {
         "presets",
         "rundir",
         "run",
+        "signals",
+        "spaces",
         "style",
         "envs.probe",
         "metrics.display",
