@@ -295,7 +295,7 @@ def _row(row: Mapping[str, Any]) -> list[str]:
     return [
         row["task"], row["label"], f"{row['seeds']}{failed}", interval(row["final_iqm"], digits),
         interval(row["area_iqm"], digits), f"{mean} +- {std}", number(row["keep_rate"], 3),
-        f"{row['env_steps'] or 0:,.0f}", interval(row["improvement"], 2),
+        number(row["env_steps"], 0), interval(row["improvement"], 2),
     ]  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from sauna import rundir
 from sauna.config import Config
 from sauna.metrics.display import duration
+from sauna.study.numbers import number
 from sauna.study.spec import Spec, check
 from sauna.study.units import Unit, parts
 
@@ -186,8 +187,8 @@ class StudyView:
         """The arms in training, as text."""
         running = [(key, cell) for key, cell in self._cells.items() if cell.running]
         told = "".join(
-            f"; {label} on {task} {cell.marks()} return {_number(cell.mean('return_mean'), 1)}, "
-            f"keep rate {_number(cell.mean('keep_rate'), 3)}"
+            f"; {label} on {task} {cell.marks()} return {number(cell.mean('return_mean'), 1)}, "
+            f"keep rate {number(cell.mean('keep_rate'), 3)}"
             for (label, task), cell in running[:NAMED]
         )
         return told + (f"; {len(running) - NAMED} more" if len(running) > NAMED else "")
@@ -208,13 +209,9 @@ class StudyView:
         for (label, task), cell in shown.items():
             share = sum(map(cell.share, cell.seeds)) / len(cell.seeds)
             table.add_row(
-                task, label, cell.marks(), f"{share:.0%}", _number(cell.mean("return_mean"), 1),
-                _number(cell.mean("keep_rate"), 3), _number(cell.rate(), 0),
+                task, label, cell.marks(), f"{share:.0%}", number(cell.mean("return_mean"), 1),
+                number(cell.mean("keep_rate"), 3), number(cell.rate(), 0),
             )  # fmt: skip
         if len(shown) < len(self._cells):
             table.caption = f"{len(self._cells) - len(shown)} more lines are complete or waiting"
         return table
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:,.{digits}f}"
