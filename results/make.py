@@ -220,13 +220,13 @@ def _revisions() -> str:
         return ""
     stored = json.loads(path.read_text())
     runs = stored["runs"]
-    revisions = len({run["revision"] for run in runs})
-    equal = sum(run["rows"] == run["equal"] for run in runs)
+    equal = sum(len(run["equal"]) for run in runs)
     return (
-        f"The runs were trained by {revisions} revisions of the package, while it was made. Of "
-        f"every study, arm and revision one run was begun again by revision {stored['now']}: the "
-        f"first {stored['iterations']} iterations of {equal} of {len(runs)} came out with the same "
-        f"bits (`{stored['command']}`)."
+        "The runs were trained by several revisions of the package, while it was made. Of every "
+        f"study, arm and revision two runs were begun again by revision {stored['now']} (not of coins, "
+        "which need whole runs of others): up to the second point of the curves, "
+        f"{equal} of {sum(len(run['env_steps']) for run in runs)} came out with the same numbers "
+        f"(`{stored['command']}`)."
     )
 
 
