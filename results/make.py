@@ -143,6 +143,7 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
     """Every arm of a study as a Markdown table, the paper's numbers beside it."""
     wanted = {(task, arm.label): len(arm.seeds) for arm in load_spec(name).arms
               for task in arm.tasks}  # fmt: skip
+    is_ppo = results["settings"].get("algorithm", "ppo") == "ppo"
     lines = [
         "| task | arm | seeds | final return, IQM [95%] | mean +- std | keep rate | against | P(better) [95%] | paper |",  # noqa: E501
         "|---|---|---|---|---|---|---|---|---|",
@@ -150,14 +151,15 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
     for row in summary["table"]:
         seeds = f"{row['seeds']} of {wanted[row['task'], row['label']]}"
         failed = f", {row['failed']} failed" if row["failed"] else ""
-        digits = digits_of([row["final_mean"]])
+        digits = digits_of(r["final_iqm"][0] for r in summary["table"] if r["task"] == row["task"])
         std = number(row["final_std"], digits)
         lines.append(
             f"| {row['task']} | {row['label']} | {seeds}{failed} | "
             f"{interval(row['final_iqm'], digits)} | "
             f"{number(row['final_mean'], digits)} +- {std} | "
             f"{number(row['keep_rate'], 3)} | {row['baseline'] or '-'} | "
-            f"{interval(row['improvement'], 2)} | {_paper(row['task'], row['label'])} |"
+            f"{interval(row['improvement'], 2)} | "
+            f"{_paper(row['task'], row['label']) if is_ppo else '-'} |"
         )
     return "\n".join(lines)
 
@@ -207,10 +209,16 @@ def _verdicts(found: list[dict[str, Any]]) -> str:
         return _listed(verdict["text"] for verdict in found)
     decided = [verdict["text"] for verdict in found if verdict["kind"] in ("better", "worse")]
     others = [verdict["text"] for verdict in found if verdict["text"] not in decided]
+    if not decided:
+        return f"None of {len(found)} comparisons is decided.\n\n{_folded('All of them', others)}"
     return (
         f"Of {len(found)} comparisons, {len(decided)} are decided.\n\n{_listed(decided)}\n\n"
-        f"<details><summary>The other {len(others)}</summary>\n\n{_listed(others)}\n\n</details>"
+        f"{_folded(f'The other {len(others)}', others)}"
     )
+
+
+def _folded(name: str, sentences: Iterable[str]) -> str:
+    return f"<details><summary>{name}</summary>\n\n{_listed(sentences)}\n\n</details>"
 
 
 def _revisions() -> str:
@@ -223,8 +231,8 @@ def _revisions() -> str:
     equal = sum(len(run["equal"]) for run in runs)
     return (
         "The runs were trained by several revisions of the package, while it was made. Of every "
-        f"study, arm and revision two runs were begun again by revision {stored['now']} (not of coins, "
-        "which need whole runs of others): up to the second point of the curves, "
+        "study, arm and revision two runs (not of coins, which need whole runs of others) were "
+        f"begun again by revision {stored['now']}: up to the second point of the curves, "
         f"{equal} of {sum(len(run['env_steps']) for run in runs)} came out with the same numbers "
         f"(`{stored['command']}`)."
     )

@@ -12,6 +12,7 @@ import pytest
 
 import chromium
 from sauna import style
+from sauna.study import tables
 from sauna.study.figures import looks_of, plots_of
 from sauna.study.report import write_report
 from sauna.study.summary import summarize
@@ -206,6 +207,14 @@ def test_the_papers_numbers_stand_beside_ours(report) -> None:
     ours = [[r["final_mean"], r["final_std"]] for r in summary["table"] if r["task"] == row[0]]
     assert page.values[page.rows.index(row)][3:] == ours
     assert next(row for row in page.rows if row[1:2] == ["\u22127.5 ± 0.8"])[0] == "Reacher-v5"
+
+
+def test_the_papers_numbers_do_not_stand_beside_another_algorithm() -> None:
+    cell = {"task": "Hopper-v5", "label": "a2c", "config": {"algorithm": "a2c"}}
+    row = {"task": "Hopper-v5", "label": "a2c", "final_mean": 1.0, "final_std": 0.0}
+    ppo = {"cells": [{**cell, "config": {"algorithm": "ppo"}}]}
+    assert "2,106" in tables.paper(ppo, {"table": [row]})
+    assert tables.paper({"cells": [cell]}, {"table": [row]}) == ""
 
 
 def test_nothing_is_fetched(report) -> None:

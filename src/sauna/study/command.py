@@ -281,16 +281,20 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     """The table and the verdicts, as text."""
     head = ["task", "arm", "seeds", "final return, IQM", "area, IQM", "mean +- std", "keep rate",
             "env steps", "P(better)"]  # fmt: skip
-    rows = [head, *(_row(row) for row in summary["table"])]
+    found = summary["table"]
+    digits = {
+        task: digits_of(row["final_iqm"][0] for row in found if row["task"] == task)
+        for task in dict.fromkeys(row["task"] for row in found)
+    }
+    rows = [head, *(_row(row, digits[row["task"]]) for row in found)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
     said = [*(v["text"] for v in summary["verdicts"]), *summary.get("measured", [])]
     return [*(line.rstrip() for line in table), "", *said]
 
 
-def _row(row: Mapping[str, Any]) -> list[str]:
+def _row(row: Mapping[str, Any], digits: int) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
-    digits = digits_of([row["final_mean"]])
     mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
     return [
         row["task"], row["label"], f"{row['seeds']}{failed}", interval(row["final_iqm"], digits),

@@ -76,7 +76,7 @@ def make_page(
         figures="".join(figure(plot, pictures[plot.name]) for plot in plots)
         or "<p>There is nothing to draw yet.</p>",
         layout="one-task" if len(summary["curves"]) == 1 else "",
-        paper=tables.paper(summary["table"]),
+        paper=tables.paper(results, summary),
         failures=tables.failures(results["cells"]),
         settings=tables.settings(results),
         command=escape(results["command"]),

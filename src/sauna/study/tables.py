@@ -162,13 +162,17 @@ def over_tasks(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     return "<h3>Over all tasks</h3>" + table(head, rows, name="Over all tasks")
 
 
-def paper(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The paper's numbers beside ours, for the tasks that it has; else nothing."""
-    ours = {(row["task"], row["label"]): row for row in rows}
-    tasks = [t for t in dict.fromkeys(row["task"] for row in rows) if unversioned(t) in PAPER]
+def paper(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
+    """The paper's numbers beside those of our PPO, for the tasks that it has; else nothing."""
+    is_ppo = {
+        (cell["task"], cell["label"]): cell["config"].get("algorithm", "ppo") == "ppo"
+        for cell in results["cells"]
+    }
+    ours = {key: row for row in summary["table"] if is_ppo[key := (row["task"], row["label"])]}
+    tasks = [task for task in dict.fromkeys(task for task, _ in ours) if unversioned(task) in PAPER]
     if not tasks:
         return ""
-    labels = list(dict.fromkeys(row["label"] for row in rows if row["task"] in tasks))
+    labels = list(dict.fromkeys(label for task, label in ours if task in tasks))
     head = (
         "Task", "PPO, the paper", "SAUNA, the paper", *(f"{escape(x)}, here" for x in labels)
     )  # fmt: skip
