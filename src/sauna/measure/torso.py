@@ -20,7 +20,7 @@ from sauna.trained import TrainedPolicy
 
 EPISODES = 5
 SEED = 0  # of the first episode: the same ones for every member
-STILLS = (0, 20, 50, 100, 200, 400, 600, 900)  # env steps of the first episode
+STILLS = (0, 20, 50, 100, 200, 400, 600, 900)  # env steps of the episode that is shown
 SIDE = 160  # pixels of a still
 
 
@@ -33,13 +33,14 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
     """Plays `EPISODES` episodes with sampled actions and the frozen normaliser.
 
     Args:
-      stills: the picture that shows the first episode at `STILLS`, side by side. Where nothing
-        can be drawn it is not written, and the result says why.
+      stills: the picture that shows one episode at `STILLS`, side by side: the first in the
+        posture of most states. Where nothing can be drawn it is not written, and the result says
+        why.
 
     Returns:
       of each episode its return, its length and the share of states in which the torso is
-      `upright`; that share over all states; the env steps of the stills and the `picture` that
-      shows them, or why they are `not_drawn`.
+      `upright`; that share over all states; the index of the episode that is `shown`, the env
+      steps of its stills and the `picture` of them, or why they are `not_drawn`.
     """
     kwargs = json.loads(artifact.config.env_kwargs)
     env = make_env(artifact.config.env, kwargs)
@@ -54,12 +55,21 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
             {"return": played[0], "length": played[1], "upright": float(upright.mean())}
         )
     env.close()
-    drawn = _draw(artifact, name, kwargs, stills)
-    return {"mode": "sampled", "episodes": episodes, "upright": float(seen.mean()), **drawn}
+    share = float(seen.mean())
+    shown = usual([episode["upright"] for episode in episodes], share)
+    return {"mode": "sampled", "episodes": episodes, "upright": share,
+            **_draw(artifact, name, kwargs, shown, stills)}  # fmt: skip
 
 
-def _draw(artifact: Artifact, name: str, kwargs: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Plays the first episode once more and writes its stills."""
+def usual(upright: list[float], share: float) -> int:
+    """The first episode that is on its feet where most states (`share`) are, or on its back."""
+    return next(i for i, one in enumerate(upright) if (one > 0.5) == (share > 0.5))
+
+
+def _draw(
+    artifact: Artifact, name: str, kwargs: dict[str, Any], shown: int, path: Path
+) -> dict[str, Any]:
+    """Plays an episode once more and writes its stills."""
     from PIL import Image
 
     choose_renderer()
@@ -74,11 +84,11 @@ def _draw(artifact: Artifact, name: str, kwargs: dict[str, Any], path: Path) -> 
 
     try:
         env = make_drawn_env(artifact.config.env, kwargs)
-        play(TrainedPolicy(artifact, name, env), env, False, SEED, look)
+        play(TrainedPolicy(artifact, name, env), env, False, SEED + shown, look)
     except Exception as error:  # renderers fail in every way there is
         return {"stills": [], "not_drawn": not_drawn(error)}
     strip = Image.new("RGB", (SIDE * len(pictures), SIDE))
     for place, picture in enumerate(pictures.values()):
         strip.paste(picture, (SIDE * place, 0))
     strip.save(path, "PNG")
-    return {"stills": [*pictures], "picture": path.name}
+    return {"shown": shown, "stills": [*pictures], "picture": path.name}
