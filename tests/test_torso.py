@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from sauna.errors import BadInput
-from sauna.measure.torso import SIDE, STILLS, pitch, usual
+from sauna.measure.torso import SIDE, STILLS, clearest, pitch
 from sauna.study import torso
 from sauna.study.spec import load_spec, read_spec
 from sauna.study.units import seeds_per_unit, units_of
@@ -108,9 +108,8 @@ def test_a_difference_is_told_and_equal_ones_are_not() -> None:
 
 
 def test_the_episode_shown_is_in_the_members_posture() -> None:
-    assert usual([0.1, 0.9, 1.0], 0.67) == 1
-    assert usual([0.9, 0.5, 0.0], 0.47) == 1
-    assert usual([1.0], 1.0) == 0
+    assert clearest([0.1, 0.9, 1.0], 0.67) == 2
+    assert clearest([0.9, 0.5, 0.0, 0.0], 0.35) == 2
 
 
 def test_what_is_not_measured_yet_is_told() -> None:

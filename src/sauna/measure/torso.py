@@ -33,8 +33,8 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
     """Plays `EPISODES` episodes with sampled actions and the frozen normaliser.
 
     Args:
-      stills: the picture that shows one episode at `STILLS`, side by side: the first in the
-        posture of most states. Where nothing can be drawn it is not written, and the result says
+      stills: the picture that shows one episode at `STILLS`, side by side: the clearest in
+        the posture of most states. Where nothing can be drawn it is not written, and the result says
         why.
 
     Returns:
@@ -56,14 +56,14 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
         )
     env.close()
     share = float(seen.mean())
-    shown = usual([episode["upright"] for episode in episodes], share)
+    shown = clearest([episode["upright"] for episode in episodes], share)
     return {"mode": "sampled", "episodes": episodes, "upright": share,
             **_draw(artifact, name, kwargs, shown, stills)}  # fmt: skip
 
 
-def usual(upright: list[float], share: float) -> int:
-    """The first episode that is on its feet where most states (`share`) are, or on its back."""
-    return next(i for i, one in enumerate(upright) if (one > 0.5) == (share > 0.5))
+def clearest(upright: list[float], share: float) -> int:
+    """The episode that is the most on its feet where most states (`share`) are, or on its back."""
+    return int(np.argmax(upright) if share > 0.5 else np.argmin(upright))
 
 
 def _draw(

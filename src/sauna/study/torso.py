@@ -189,8 +189,8 @@ def _figure(measured: Mapping[str, Any], place: Path) -> str:
     text = escape(", ".join(f"{label} seed {one.seed}, {_posture(one)}" for label, one in pair))
     return (
         f'<figure id="stills"><figcaption>One pair at equal times, in env steps: {text}. The first '
-        f"seed whose postures differ that way, or the first of all; of each its first episode in "
-        f"that posture.</figcaption>"
+        f"seed whose postures differ that way, or the first of all; of each its clearest "
+        f"episode in that posture.</figcaption>"
         f'<div class="wide" role="region" tabindex="0" aria-label="Stills"><img alt="Stills of '
         f'{text}" style="display:block;width:100%;min-width:48rem;background:#fff" '
         f'src="data:image/png;base64,{data}"></div></figure>'
