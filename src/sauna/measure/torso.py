@@ -34,8 +34,8 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
 
     Args:
       stills: the picture that shows one episode at `STILLS`, side by side: the clearest in
-        the posture of most states. Where nothing can be drawn it is not written, and the result says
-        why.
+        the posture of most states. Where nothing can be drawn it is not written, and the result
+        says why.
 
     Returns:
       of each episode its return, its length and the share of states in which the torso is
