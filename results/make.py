@@ -26,7 +26,7 @@ from claims import HEADER, claims_rows, told
 
 from sauna.study import dial, noise, torso
 from sauna.study.figures import draw_plots, write_figures
-from sauna.study.numbers import digits_of, interval, number
+from sauna.study.numbers import digits_of, digits_of_tasks, interval, number
 from sauna.study.page import rounded
 from sauna.study.report import UNFOLDED
 from sauna.study.results import gather
@@ -143,6 +143,7 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
     """Every arm of a study as a Markdown table, the paper's numbers beside it."""
     wanted = {(task, arm.label): len(arm.seeds) for arm in load_spec(name).arms
               for task in arm.tasks}  # fmt: skip
+    digits_of_task = digits_of_tasks(summary["table"])
     is_ppo = results["settings"].get("algorithm", "ppo") == "ppo"
     lines = [
         "| task | arm | seeds | final return, IQM [95%] | mean +- std | keep rate | against | P(better) [95%] | paper |",  # noqa: E501
@@ -151,7 +152,7 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
     for row in summary["table"]:
         seeds = f"{row['seeds']} of {wanted[row['task'], row['label']]}"
         failed = f", {row['failed']} failed" if row["failed"] else ""
-        digits = digits_of(r["final_iqm"][0] for r in summary["table"] if r["task"] == row["task"])
+        digits = digits_of_task[row["task"]]
         std = number(row["final_std"], digits)
         lines.append(
             f"| {row['task']} | {row['label']} | {seeds}{failed} | "
@@ -290,6 +291,7 @@ def why() -> str:
         parts.append(_listed(study.verdicts(measured)))
         if study is torso and STILLS.exists():
             parts.append(f"![Stills of one pair](why/figures/{STILLS.name})")
+            parts.append("Of each its clearest episode in the posture that it is mostly in.")
         parts += [f"![{p.title}](why/figures/{p.name}.png)\n\n{p.caption}" for p in extra.plots]
         parts.append(_markdown(study.text_table(measured)))
         parts.append(study.ABOUT)

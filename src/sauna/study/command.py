@@ -23,7 +23,7 @@ from sauna.signals import handled
 from sauna.spaces import Spaces
 from sauna.study.local import LocalExecutor
 from sauna.study.measuring import gather_measured, items_of, measure
-from sauna.study.numbers import digits_of, interval, number
+from sauna.study.numbers import digits_of_tasks, interval, number
 from sauna.study.results import gather, typed
 from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
@@ -281,12 +281,8 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     """The table and the verdicts, as text."""
     head = ["task", "arm", "seeds", "final return, IQM", "area, IQM", "mean +- std", "keep rate",
             "env steps", "P(better)"]  # fmt: skip
-    found = summary["table"]
-    digits = {
-        task: digits_of(row["final_iqm"][0] for row in found if row["task"] == task)
-        for task in dict.fromkeys(row["task"] for row in found)
-    }
-    rows = [head, *(_row(row, digits[row["task"]]) for row in found)]
+    digits = digits_of_tasks(summary["table"])
+    rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
     said = [*(v["text"] for v in summary["verdicts"]), *summary.get("measured", [])]

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 
 def digits_of(values: Iterable[float | None]) -> int:
     """Decimals that leave three or four digits of the largest, as papers print returns."""
     largest = max((abs(v) for v in values if v is not None), default=0.0)
     return 0 if largest >= 500 else 1 if largest >= 10 else 2 if largest >= 1 else 3
+
+
+def digits_of_tasks(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """For each task of a summary's table, decimals that all its arms share."""
+    return {
+        task: digits_of(row["final_iqm"][0] for row in rows if row["task"] == task)
+        for task in dict.fromkeys(row["task"] for row in rows)
+    }
 
 
 def number(value: float | None, digits: int) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from sauna.study.numbers import digits_of
+from sauna.study.numbers import digits_of, digits_of_tasks
 
 MINUS, DOT = "\N{MINUS SIGN}", "\N{MIDDLE DOT}"
 # Table 1 of the SAUNA paper, as printed.
@@ -100,9 +100,8 @@ def main_table(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
         "Seeds",
     )  # fmt: skip
     rows: list[tuple[str, Sequence[str]]] = []
-    for task in dict.fromkeys(row["task"] for row in summary["table"]):
+    for task, digits in digits_of_tasks(summary["table"]).items():
         of_task = [row for row in summary["table"] if row["task"] == task]
-        digits = digits_of(row["final_iqm"][0] for row in of_task)
         rows.append((escape(task), ()))
         for row in of_task:
             final = with_interval(row["final_iqm"], digits)
