@@ -83,6 +83,8 @@ def collect(name: str) -> None:
     folder = ROOT / "runs" / "units"
     results = gather(spec, units_of(spec, size), folder, f"sauna study {name}")
     results["cells"] = [cell for cell in map(_thinned, results["cells"]) if cell["members"]]
+    if not results["cells"]:
+        return
     for cell in results["cells"]:
         del cell["config"]  # the command says what differs from the preset
     text = json.dumps(results, separators=(",", ":"))
@@ -291,7 +293,7 @@ def why() -> str:
         parts.append(_listed(study.verdicts(measured)))
         if study is torso and STILLS.exists():
             parts.append(f"![Stills of one pair](why/figures/{STILLS.name})")
-            parts.append("Of each its clearest episode in the posture that it is mostly in.")
+            parts.append(f"{torso.chosen(measured)} Of each its clearest episode in that posture.")
         parts += [f"![{p.title}](why/figures/{p.name}.png)\n\n{p.caption}" for p in extra.plots]
         parts.append(_markdown(study.text_table(measured)))
         parts.append(study.ABOUT)
@@ -349,6 +351,8 @@ def pong(results: dict[str, Any]) -> str:
     member = results["cells"][0]["members"][0]
     steps, score = (member["curve"][key] for key in ("env_steps", "return_mean"))
     told = [(n, x) for n, x in zip(steps, score, strict=True) if x is not None]
+    if member["status"] != "complete" or not told:
+        return f"The run failed (`{results['command']}`)."
     (early, low), (late, high) = told[0], told[-1]
     text = (
         f"PPO, one seed (`{results['command']}`): the mean training score of the last 100 games is "

@@ -16,8 +16,10 @@ from helpers import environment
 from sauna.errors import BadInput
 from sauna.measure.coverage import particle_entropy
 from sauna.study.dial import correlation, extra, marks, text_table, verdicts
-from sauna.study.measuring import ALONG, Item, scale_of
+from sauna.study.measuring import ALONG, Item, gather_measured, items_of, scale_of
+from sauna.study.results import gather
 from sauna.study.spec import load_spec, read_spec
+from sauna.study.units import units_of
 
 
 def test_coverage_is_the_entropy_of_what_is_known() -> None:
@@ -61,6 +63,22 @@ def test_a_dial_is_found_where_there_is_one_and_only_there() -> None:
         found += "no evidence that the threshold is a dial" not in verdicts(study(*flat))[0]
     assert found <= 2
     assert "no answer yet" in verdicts(study(*RISING[:2]))[0]
+
+
+def test_an_arm_is_told_apart_from_its_coin_pair_by_pair() -> None:
+    """Entropy and coverage of the coins lie 0.2 below, seed by seed; or not at all."""
+    for gaps, said in (
+        ([0.2, 0.2, 0.2], "told apart by entropy and coverage and return (threshold minus coin: "
+         "entropy 0.20 [0.20, 0.20], coverage 0.20 [0.20, 0.20], return -0.20 [-0.20, -0.20])"),
+        ([0.2, -0.3, 0.1], "are not told apart (threshold minus coin: entropy 0.0"),
+    ):  # fmt: skip
+        values = [x - gap for x, gap in zip([0.5, 0.6, 0.4], gaps, strict=True)]
+        coin = cell("coin", values, arm="random-drop", rates_of="0.5")
+        told = verdicts(study(*RISING, coin))
+        assert len(told) == 2 and said in told[1], told[1]
+        assert told[1].startswith("A-v0: threshold 0.5 and a coin that drops as much are ")
+    few = cell("coin", [0.1], arm="random-drop", rates_of="0.5")
+    assert "not told apart" in verdicts(study(*RISING, few))[1]
 
 
 def test_the_p_value_is_that_of_all_deals() -> None:
@@ -172,3 +190,18 @@ def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> 
         for c in held:
             for member in c["members"]:
                 assert abs(member["keep_rate"] - c["config"]["keep_rate_target"]) < 0.05
+    next(
+        iter(files)
+    ).unlink()  # as if interrupted there: the member's other points alone say nothing
+    spec = load_spec(str(tmp_path / "small.toml"))
+    units = units_of(spec, json.loads((place / "study.json").read_text())["seeds_per_unit"])
+    folder = place.parent / "units"
+    part = gather_measured(spec, units, folder, place, gather(spec, units, folder, "study"))
+    left = [len(member["points"]) for cell in part["cells"] for member in cell["members"]]
+    assert sum(map(bool, left)) == len(number) - 1
+    assert "1 members" in run()
+    last, *others = items_of(spec, units, folder, place)
+    assert all(item.is_done for item in [last, *others])
+    manifest = last.run / "checkpoints" / f"{last.iterations[-1]:08d}" / "manifest.json"
+    manifest.write_text(manifest.read_text() + "\n")  # another checkpoint of the same number
+    assert sum(not item.is_done for item in items_of(spec, units, folder, place)) == 1

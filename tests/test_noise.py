@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from helpers import configured
-from sauna import train
+from sauna import measure, train
 from sauna.core.gradient import policy_gradient
 from sauna.core.normalize import Moments, normalize
 from sauna.core.policy import make_policy
@@ -20,7 +20,14 @@ from sauna.core.update import minibatch_losses
 from sauna.errors import BadInput
 from sauna.measure import estimates, noise
 from sauna.measure.estimates import Gradients, estimate
-from sauna.measure.streams import Standing, Stream, fresh_streams, load_standing
+from sauna.measure.streams import (
+    Fresh,
+    Standing,
+    Stream,
+    fresh_streams,
+    load_standing,
+    moved_in_time,
+)
 from sauna.selection.vex import TARGETS
 from sauna.study.noise import extra, over_members, text_table, verdicts
 from sauna.study.spec import read_spec
@@ -153,12 +160,17 @@ def standing(run: Path) -> Standing:
 
 
 @pytest.fixture(scope="module")
-def streams(standing: Standing) -> list[Stream]:
+def fresh(standing: Standing) -> Fresh:
     return fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2)
 
 
+@pytest.fixture(scope="module")
+def streams(fresh: Fresh) -> list[Stream]:
+    return fresh.streams
+
+
 def test_streams_are_the_members_next_rollouts(run: Path, standing: Standing, streams: Any) -> None:
-    again = fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2)
+    again = fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2).streams
     for one, other in zip(streams, again, strict=True):
         assert all(np.array_equal(x, y) for x, y in zip(one, other, strict=True))
     moments = Moments(*(standing.arrays[f"observation_moments/{name}"]
@@ -174,10 +186,41 @@ def test_streams_are_the_members_next_rollouts(run: Path, standing: Standing, st
     assert not any(np.array_equal(starts[0], other) for other in starts[1:])
 
 
-def test_a_measurement_has_every_estimate(
-    standing: Standing, streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+def test_every_env_step_of_a_measurement_is_counted(
+    standing: Standing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(noise, "fresh_streams", lambda *given: streams)
+    taken = []
+    step = measure.streams._Recorded.step
+
+    def counted(self: Any, action: np.ndarray, active: np.ndarray) -> Any:
+        taken.append(int(active.sum()))
+        return step(self, action, active)
+
+    monkeypatch.setattr(measure.streams._Recorded, "step", counted)
+    found = fresh_streams(standing, 3, 1).counts
+    assert found["env_steps_used"] + found["env_steps_thrown_away"] == sum(taken)
+    assert found["env_steps_thrown_away"] > 0
+
+
+def test_a_moved_time_line_keeps_its_order_and_its_bunches() -> None:
+    """Two envs, three rollouts of 2 and 1 env steps: moved round all of them, not within one."""
+    lines = [np.array([1, 2, 3, 4, 5, 6]), np.array([-1, -2, -3])]
+    rollouts = [[lines[0][2 * i : 2 * i + 2], lines[1][i : i + 1]] for i in range(3)]
+    offsets = set()
+    for seed in range(20):
+        moved = moved_in_time(rollouts, np.random.default_rng(seed))
+        first, second = moved.reshape(3, 3)[:, :2].ravel(), moved.reshape(3, 3)[:, 2]
+        at = (int(np.flatnonzero(first == 1)[0]), int(np.flatnonzero(second == -1)[0]))
+        np.testing.assert_array_equal(np.roll(lines[0], at[0]), first)
+        np.testing.assert_array_equal(np.roll(lines[1], at[1]), second)
+        offsets.add(at)
+    assert len({first for first, _ in offsets}) > 3 and len({one for _, one in offsets}) == 3
+
+
+def test_a_measurement_has_every_estimate(
+    standing: Standing, fresh: Fresh, streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noise, "fresh_streams", lambda *given: fresh)
     found = noise.measure(standing, streams=len(streams))
     assert found["streams"] == {"reference": 8, "tested": 8, "usable": 8}
     assert found["minibatch"] == 16 and found["as_trained"] == "standardized"
@@ -202,7 +245,7 @@ def test_minibatches_come_from_their_groups(streams: list[Stream]) -> None:
     assert all(len(set(part)) == 16 for part in rows.reshape(-1, 16).tolist())
 
 
-def point(at: float, snr: float, coin: float = 0.010) -> dict[str, Any]:
+def point(at: float, snr: float, coin: float = 0.010, raw: float = 1.0) -> dict[str, Any]:
     groups = {
         name: {
             "snr": [x, 0, 1],
@@ -214,8 +257,14 @@ def point(at: float, snr: float, coin: float = 0.010) -> dict[str, Any]:
     }
     difference = {"snr": [snr - coin, 0, 0], "cosine": [snr - coin, 0, 0],
                   "snr_per_env_step": [0.001, 0, 0], "variance_ratio": [1.2, 1, 2]}  # fmt: skip
-    differences = dict.fromkeys(("dropped - coin", "kept - coin", "dropped - shifted"), difference)
-    rules = {"standardized": {"groups": groups, "differences": differences}}
+    pairs = ("dropped - coin", "kept - coin", "dropped - shifted")
+    rules = {
+        "standardized": {"groups": groups, "differences": dict.fromkeys(pairs, difference)},
+        "raw": {
+            "groups": groups,
+            "differences": {key: {"variance_ratio": [raw, 0, 9]} for key in pairs},
+        },
+    }
     return {"point": at, "keep_rate": 0.7, "minibatch": 64, "as_trained": "standardized",
             "rules": rules}  # fmt: skip
 
@@ -229,10 +278,10 @@ def measured(*members: list[dict[str, Any]]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "snrs, said",
     [
-        ((0.002, 0.003, 0.001), "what the filter drops is noisier than"),
-        ((0.022, 0.023, 0.021), "what the filter drops is less noisy"),
-        ((0.002, 0.018, 0.010), "no evidence"),
-        ((0.002,), "too few members"),
+        ((0.002, 0.003, 0.001), "by signal to noise it is noisier than that"),
+        ((0.022, 0.023, 0.021), "by signal to noise it is less noisy than that"),
+        ((0.002, 0.018, 0.010), "by signal to noise it is not told from that"),
+        ((0.002,), "by signal to noise it is of too few members"),
     ],
 )
 def test_the_verdict_follows_the_interval_over_members(snrs: tuple, said: str) -> None:
@@ -242,6 +291,31 @@ def test_the_verdict_follows_the_interval_over_members(snrs: tuple, said: str) -
     page = extra(found)
     assert said in page.html and [len(plot.panels[0].lines) for plot in page.plots] == [4, 4, 4]
     assert len(text_table(found)[1]) == len(text_table(found)[0])
+
+
+@pytest.mark.parametrize(
+    "ratios, said",
+    [
+        ((1.5, 2.0, 2.5), "by variance what the filter drops is noisier than what a coin drops"),
+        ((0.5, 0.6, 0.55), "by variance what the filter drops is less noisy than"),
+        ((0.5, 2.0, 1.0), "by variance what the filter drops is not told from"),
+    ],
+)
+def test_variance_is_told_of_advantages_as_they_are(ratios: tuple, said: str) -> None:
+    """Geometric: half and twice are as far from 1. `point` has 1.2 where they are standardised."""
+    found = measured(*([point(0.5, 0.01, raw=x), point(1.0, 0.01, raw=x)] for x in ratios))
+    assert said in verdicts(found)[0]
+    assert "have 1.200 [1.200, 1.200] times the variance" in verdicts(found)[0]
+    path = ("differences", "dropped - coin", "variance_ratio")
+    mean = over_members(found["cells"][0], *path, raw=True).value
+    assert mean == pytest.approx(np.prod(ratios) ** (1 / 3))
+
+
+def test_an_alignment_says_how_many_checkpoints_it_is_known_at() -> None:
+    unknown = point(1.0, 0.01)
+    unknown["rules"]["standardized"]["groups"]["kept"]["alignment"] = [None, None, None]
+    head, row = text_table(measured([point(0.5, 0.01), unknown], [point(0.5, 0.01)]))
+    assert row[head.index("Alignment of kept")] == "1.0 [1.0, 1.0], 2 of 3"
 
 
 def test_where_nothing_was_dropped_nothing_is_said() -> None:

@@ -130,7 +130,11 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
     for label, level in (("ppo", 0), ("sauna", 200)):
         strip = Image.new("RGB", (SIDE * len(STILLS), SIDE), (level, 50, 0))
         strip.save(tmp_path / "torso" / f"{label}-3.png")
+    assert torso.chosen(found) == ("Chosen for the contrast: the first seed of which only sauna is "
+                                   "on its feet (1 of 4; only ppo in 1).")  # fmt: skip
+    assert "failing that the first of all" in torso.chosen(measured([0.9, 0.1], [0.9, 0.1]))
     extra = torso.extra(found, tmp_path)
+    assert "Chosen for the contrast" in extra.html and "Chosen" in extra.plots[0].caption
     picture = Image.open(tmp_path / "figures" / "stills.png")
     assert picture.width > picture.height
     drawn = np.asarray(picture.convert("RGB"))

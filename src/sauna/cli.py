@@ -318,7 +318,7 @@ def _bench(values: dict[str, Any]) -> None:
                                  say=_say)  # fmt: skip
         print("\n".join(report_on_device(result)))
     elif values["scale"]:
-        result = bench_scale({"arm": "ppo", **given}, rounds, _say)
+        result = bench_scale(given, rounds, _say)
     else:
         result = bench(given, rounds=rounds, iterations=iterations, against=against,
                        script=Path(script) if script else None, say=_say)  # fmt: skip

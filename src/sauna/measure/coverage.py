@@ -35,13 +35,12 @@ def measure(standing: Standing, scale: Standing) -> dict[str, Any]:
       scale: the member whose normaliser, as it was there, scales the observations.
     """
     steps = standing.config.rollout_steps
-    streams = fresh_streams(standing, STREAMS, -(-STEPS // steps), limit=steps)
+    fresh = fresh_streams(standing, STREAMS, -(-STEPS // steps), limit=steps)
     mean, variance = (scale.arrays[f"observation_moments/{n}"] for n in ("mean", "variance"))
-    seen = np.concatenate([stream.seen[::EVERY] for stream in streams])
+    seen = np.concatenate([stream.seen[::EVERY] for stream in fresh.streams])
     return {
         "coverage": particle_entropy((seen - mean) / np.sqrt(variance + 1e-8)),
-        "keep_rate": float(np.mean(np.concatenate([stream.keep for stream in streams]))),
-        "observations": len(seen),
+        **fresh.counts,
     }
 
 

@@ -47,13 +47,14 @@ def measure(standing: Standing, streams: int = STREAMS) -> dict[str, Any]:
     config = standing.config
     rollout = config.rollout_steps * config.envs
     size = rollout // config.minibatches
-    collected = fresh_streams(standing, streams, -(-STEPS // rollout))
+    fresh = fresh_streams(standing, streams, -(-STEPS // rollout))
+    collected = fresh.streams
     reference, tested = collected[: streams // 2], collected[streams // 2 :]
     usable = [stream for stream in tested if _smallest(stream) >= size]
     keep = np.concatenate([stream.keep for stream in collected])
     found: dict[str, Any] = {
         "keep_rate": float(keep.mean()),
-        "env_steps_used": len(keep),
+        **fresh.counts,
         "minibatch": size,
         "streams": {"reference": len(reference), "tested": len(tested), "usable": len(usable)},
         "as_trained": "standardized" if config.normalize_advantages else "raw",

@@ -50,14 +50,27 @@ class Standing(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """The `n` env steps of one stream, each env's in time order."""
+    """The `n` env steps of one stream: rollout after rollout, in each of them env after env."""
 
     observation: np.ndarray  # [n, *obs] normalised
     action: np.ndarray  # [n, A]
     advantage: np.ndarray  # [n] over the full stream, dropped steps included
     keep: np.ndarray  # [n] bool, the filter's decisions
-    shifted: np.ndarray  # [n] bool, the same decisions moved in time by a random offset
+    shifted: np.ndarray  # [n] bool, the same decisions moved in time by a random offset per env
     seen: np.ndarray  # [n, *obs] what the environment showed, not normalised
+
+
+class Fresh(NamedTuple):
+    """Independent streams, and the env steps that were thrown away before they began."""
+
+    streams: list[Stream]
+    thrown_away: int
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Every env step that was taken."""
+        used = sum(len(stream.keep) for stream in self.streams)
+        return {"env_steps_used": used, "env_steps_thrown_away": self.thrown_away}
 
 
 def load_standing(run: Path, name: str, iteration: int) -> Standing:
@@ -87,7 +100,7 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
 
 def fresh_streams(
     standing: Standing, number: int, rollouts: int, limit: int | None = None
-) -> list[Stream]:
+) -> Fresh:
     """`number` independent streams of `rollouts` rollouts; the same for the same checkpoint.
 
     Args:
@@ -108,9 +121,10 @@ def fresh_streams(
         params = np.tile(np.asarray(standing.params), (number, 1))
         hypers = [standing.hypers] * number
         _put_moments(collector, standing)
-        first = _warm_up(collector, params, hypers, random.integers(WARM_UP, size=number),
-                         config.rollout_steps)  # fmt: skip
+        before = random.integers(WARM_UP, size=number)
+        first = _warm_up(collector, params, hypers, before, config.rollout_steps)
         parts: list[list[Stream]] = [[] for _ in seeds]
+        decisions: list[list[list[np.ndarray]]] = [[] for _ in seeds]
         whole = np.full(number, limit or capacity(config))
         advantages = jax.jit(
             partial(advantages_over_all, bootstrap_truncated=config.truncation == "bootstrap")
@@ -123,10 +137,17 @@ def fresh_streams(
             for p, own in enumerate(collected):
                 assert own.rollout is not None
                 advantage = np.asarray(advantages(own.rollout, standing.hypers))
-                parts[p].append(_flat(own.rollout, advantage, seen[:, p], random))
+                parts[p].append(_flat(own.rollout, advantage, seen[:, p]))
+                decisions[p].append([x.copy() for x in _of_envs(own.rollout.keep, own.rollout)])
     finally:
         envs.close()
-    return [Stream(*map(np.concatenate, zip(*own, strict=True))) for own in parts]
+    streams = [
+        Stream(*map(np.concatenate, zip(*own, strict=True)))._replace(
+            shifted=moved_in_time(of_rollouts, random)
+        )
+        for own, of_rollouts in zip(parts, decisions, strict=True)
+    ]
+    return Fresh(streams, int(before.sum()) * config.envs)
 
 
 def _warm_up(
@@ -152,21 +173,38 @@ def _put_moments(collector: HostCollector, standing: Standing) -> None:
             place[...] = fitting(standing.arrays, key, place)
 
 
-def _flat(
-    rollout: Rollout, advantage: np.ndarray, seen: np.ndarray, random: np.random.Generator
-) -> Stream:
-    """The valid steps of a rollout `[S, N]`, env after env, copied."""
+def moved_in_time(decisions: list[list[np.ndarray]], random: np.random.Generator) -> np.ndarray:
+    """A stream's decisions, each env's moved round its whole time line by one random offset.
+
+    Moved within a rollout, those of A2C's short ones would hardly move.
+
+    Args:
+      decisions: of each rollout, of each env, `[steps]`; steps may differ.
+
+    Returns:
+      `[n]` in the order of a stream.
+    """
+    moved = []
+    for rollouts in zip(*decisions, strict=True):
+        whole = np.concatenate(rollouts)
+        ends = np.cumsum([len(part) for part in rollouts])[:-1]
+        moved.append(np.split(np.roll(whole, random.integers(len(whole))), ends))
+    return np.concatenate([part for envs in zip(*moved, strict=True) for part in envs])
+
+
+def _of_envs(x: Any, rollout: Rollout) -> list[np.ndarray]:
+    """The valid steps of `x` `[S, N, ...]`, for each env: `[steps, ...]`."""
     steps = np.asarray(rollout.valid).sum(0)
+    return [np.asarray(x)[:length, n] for n, length in enumerate(steps)]
 
-    def flat(x: Any) -> np.ndarray:
-        return np.concatenate([np.asarray(x)[:length, n] for n, length in enumerate(steps)])
 
-    keep = np.asarray(rollout.keep)
-    moved = [np.roll(keep[:length, n], random.integers(length)) for n, length in enumerate(steps)]
-    return Stream(
-        flat(rollout.observation), flat(rollout.action), flat(advantage), flat(keep),
-        np.concatenate(moved), flat(seen),
-    )  # fmt: skip
+def _flat(rollout: Rollout, advantage: np.ndarray, seen: np.ndarray) -> Stream:
+    """The valid steps of a rollout `[S, N]`, env after env, copied; nothing is moved yet."""
+    observation, action, advantage, keep, seen = (
+        np.concatenate(_of_envs(x, rollout))
+        for x in (rollout.observation, rollout.action, advantage, rollout.keep, seen)
+    )
+    return Stream(observation, action, advantage, keep, keep, seen)
 
 
 class _Recorded:

@@ -5,12 +5,13 @@ coverage (mean over the checkpoints) and the final return, each one number per m
 of them follows a constant threshold is asked by rank correlation over members; its p value is that
 of dealing the members' thresholds out at random, corrected by Holm's method for the three
 quantities of a task. A filter that drops more also updates less often in the same env steps: arms
-that drop as much by coin say how much of an effect that is.
+that drop as much by coin say how much of an effect that is. A coin's member repeats the drop rates
+of one member of the filter, so these are compared pair by pair, by Student's t.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
@@ -39,7 +40,9 @@ ABOUT = (
     "whose threshold moves its median over training is shown. Rank correlations are over members "
     "of arms with a constant threshold, p by dealing their thresholds out at random, after Holm's "
     "correction for the three quantities of a task. Fewer kept steps are also fewer updates in the "
-    "same env steps: arms that drop as much by coin show what that alone does."
+    "same env steps: arms that drop as much by coin show what that alone does. Differences from a "
+    "coin are means over pairs of members with the same drop rates; in brackets 95%, not corrected "
+    "for their number."
 )
 LOOKS = {"constant": "sauna", "scheduled": "vex-head", "held keep rate": "ppo",
          "coin, dropping as much": "random-drop"}  # fmt: skip
@@ -52,6 +55,7 @@ class Mark(NamedTuple):
     label: str
     threshold: float  # of a coin, that of the arm whose rates it repeats
     members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
+    drops_like: str | None = None  # of a coin, the arm whose drop rates it repeats
 
 
 def extra(measured: Mapping[str, Any]) -> Extra:
@@ -82,7 +86,7 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
         stands_for = cell["rates_of"] if kind.startswith("coin") else cell["label"]
         threshold = thresholds.get(stands_for)
         if threshold is not None:
-            found.append(Mark(kind, cell["label"], threshold, numbers))
+            found.append(Mark(kind, cell["label"], threshold, numbers, cell["rates_of"]))
     return found
 
 
@@ -156,7 +160,33 @@ def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | N
 
 def verdicts(measured: Mapping[str, Any]) -> list[str]:
     """The answer for each task, in sentences that claim no more than their tests."""
-    return [_verdict(task, marks(measured, task)) for task in tasks_of(measured)]
+    return [said for task in tasks_of(measured) if (found := marks(measured, task))
+            for said in (_verdict(task, found), *_beside_coins(task, found))]  # fmt: skip
+
+
+def beside_coin(arm: Mark, coin: Mark, key: str) -> Estimate:
+    """Mean over the seeds that both have of arm minus coin, and its interval."""
+    own, other = dict(arm.members[key]), dict(coin.members[key])
+    pairs = [(seed, own[seed] - other[seed]) for seed in own if seed in other]
+    return over_members(arm._replace(members={key: pairs}), key)
+
+
+def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
+    """Whether an arm does what a coin that drops as much does as well: a sentence for each coin."""
+    arms = {mark.label: mark for mark in found}
+    for coin in found:
+        if coin.drops_like not in arms:
+            continue
+        said, apart = [], []
+        for key, name, *_ in QUANTITIES:
+            if key in ASKED:
+                value, low, high = beside_coin(arms[coin.drops_like], coin, key)
+                said.append(f"{name} {shown(Estimate(value, low, high))}")
+                if low is not None and high is not None and not low <= 0 <= high:
+                    apart.append(name)
+        kind = f"told apart by {' and '.join(apart)}" if apart else "not told apart"
+        yield f"{task}: threshold {coin.drops_like} and a coin that drops as much are {kind} " \
+              f"(threshold minus coin: {', '.join(said)})."  # fmt: skip
 
 
 def _verdict(task: str, found: Sequence[Mark]) -> str:

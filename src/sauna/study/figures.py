@@ -90,7 +90,8 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
         "explained_variance",
         "explained_variance",
         "Explained variance",
-        "Share of the returns' variance that the value function explains. The axis is cut at -1.",
+        "Share of the returns' variance that the value function explains, over the env steps that "
+        "the update learned from, which a filter chooses. The axis is cut at -1.",
         "explained variance",
         (-1.0, 1.0),
     ),

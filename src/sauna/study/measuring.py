@@ -1,11 +1,13 @@
 """The second phase of a study: what is measured of its members at checkpoints along training.
 
-Each measurement is a file of its own under the study's folder, named after the run, the seed and
-the checkpoint, so that a study that is run again measures what is missing.
+Each measurement is a file of its own under the study's folder, named after the run, the seed, the
+checkpoint and what the checkpoint holds: a study that is run again measures what is missing, and
+what was trained again is measured again.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import queue
 from collections.abc import Callable, Iterator, Mapping
@@ -55,13 +57,21 @@ def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterat
             for part in parts(unit, folder):
                 if not part.is_complete(folder):
                     continue
+                run = part.run(folder)
                 for seed in part.seeds:
                     points = POINTS[spec.measure]
-                    chosen = checkpoints_at(part.run(folder), seed, config.steps, points)
+                    chosen = checkpoints_at(run, seed, config.steps, points)
                     name = f"{part.name.replace('/', '_')}_{seed}"
-                    files = [place / spec.measure / f"{name}_{i:08d}.json" for i in chosen.values()]
-                    yield Item(unit.task, arm.label, arm.arm, seed, part.run(folder),
+                    files = [place / spec.measure / f"{name}_{i:08d}_{_mark(run, i)}.json"
+                             for i in chosen.values()]  # fmt: skip
+                    yield Item(unit.task, arm.label, arm.arm, seed, run,
                                [*chosen], [*chosen.values()], files)  # fmt: skip
+
+
+def _mark(run: Path, iteration: int) -> str:
+    """Eight digits that tell a checkpoint from another of the same number."""
+    manifest = run / "checkpoints" / f"{iteration:08d}" / "manifest.json"
+    return hashlib.sha256(manifest.read_bytes() if manifest.exists() else b"").hexdigest()[:8]
 
 
 def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) -> dict[float, int]:
@@ -177,14 +187,15 @@ def gather_measured(
 ) -> dict[str, Any]:
     """What has been measured so far, beside the numbers of `results` that it is set against.
 
-    Every cell of `results` is there, and of each complete member its `points`.
+    Every cell of `results` is there, and of each complete member its `points`: none of a member
+    whose later checkpoints are still to be measured, since early ones alone would pass for all.
     """
     points: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for item in items_of(spec, units, folder, place):
         points[item.task, item.label, item.seed] = [
             {"point": point, **json.loads(file.read_text())}
             for point, file in zip(item.points, item.files, strict=True)
-            if file.exists()
+            if item.is_done
         ]
     arms = {arm.label: arm for arm in spec.arms}
     cells = []

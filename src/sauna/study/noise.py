@@ -1,8 +1,13 @@
 """Is what the filter drops noisier than what a coin drops? What `sauna study noise` says of it.
 
-Every number is of one member first: the mean over its checkpoints. Intervals are Student's t over
-members, because checkpoints and minibatches of one training are not independent of each other. The
-bootstrap intervals of single checkpoints are in the result file.
+Noise has two measures here. Signal to noise is with advantages as in training. Variance is with
+advantages as they are: to standardise those of a minibatch of dropped steps would divide out what
+makes them noisy, and training never has such a minibatch.
+
+Every number is of one member first: the mean over its checkpoints (of ratios of variances the
+geometric mean). Intervals are Student's t over members, because checkpoints and minibatches of one
+training are not independent of each other. The bootstrap intervals of single checkpoints are in the
+result file.
 """
 
 from __future__ import annotations
@@ -27,10 +32,14 @@ ABOUT = (
     "of steps dropped by the filter's decisions moved in time (shifted: as many, and as bunched). "
     "Signal to noise is the squared length of a group's mean gradient over the trace of its "
     "covariance, for one minibatch; variance is that trace, in the table one group's over "
-    "another's. Cosine is that of a minibatch's gradient and of a large independent batch of all "
-    "steps. Alignment is the cosine with endless minibatches: below 1 where the group's gradient "
-    "is biased, not only noisy. In brackets: 95% over members, each the mean of its checkpoints; "
-    "not corrected for the number of comparisons."
+    "another's. Advantages are standardised in each minibatch as in training, except where raw is "
+    "said: of steps with large advantages both signal and variance are large then, and the one can "
+    "rise without the other. Cosine is that of a minibatch's gradient and of a large independent "
+    "batch of all steps. Alignment is the cosine with endless minibatches: below 1 where the "
+    "group's gradient is biased, not only noisy; it is known only at checkpoints with a signal "
+    "that can be told from none (how many stands behind it), and its estimates go above 1. In "
+    "brackets: 95% over members, each the mean of its checkpoints; not corrected for the number of "
+    "comparisons."
 )
 # key in the figures, title, caption, y axis, its limits
 _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
@@ -38,13 +47,15 @@ _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
      "the trace of its covariance.", "signal to noise", None),
     ("cosine", "Cosine to the gradient of a large batch", "Mean cosine of a minibatch's gradient "
      "and that of all steps of an independent large batch.", "cosine", (-1.0, 1.0)),
-    ("variance", "Variance of a minibatch's gradient", "Trace of the group's covariance.",
-     "variance", None),
+    ("variance", "Variance of a minibatch's gradient beside a coin's", "Trace of the group's "
+     "covariance over that of what a coin keeps, advantages raw; means are geometric.",
+     "of a coin's variance", None),
 )  # fmt: skip
 HEAD = ("Task", "Arm", "Members", "Keep rate", "SNR kept", "SNR coin", "SNR dropped",
         "SNR dropped - coin", "SNR dropped - shifted", "SNR per env step, kept - coin",
-        "Cosine dropped - coin", "Alignment of kept", "Variance, dropped / coin",
-        "Variance, kept / coin")  # fmt: skip
+        "Cosine dropped - coin", "Alignment of kept", "Variance, kept / coin",
+        "Raw variance, kept / coin", "Raw variance, dropped / coin",
+        "Raw variance, dropped / shifted")  # fmt: skip
 
 
 def extra(measured: Mapping[str, Any]) -> Extra:
@@ -62,30 +73,35 @@ def looks() -> dict[str, style.Look]:
     return dict(zip(arms, style.looks({arm: arm for arm in arms.values()}).values(), strict=True))
 
 
-def rule(point: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """A checkpoint's estimates, advantages as in training; None where too little was dropped."""
-    return point["rules"].get(point["as_trained"])
+def rule(point: Mapping[str, Any], raw: bool = False) -> Mapping[str, Any] | None:
+    """A checkpoint's estimates, advantages as in training or `raw`.
+
+    None where too little was dropped.
+    """
+    return point["rules"].get("raw" if raw else point["as_trained"])
 
 
-def over_members(cell: Mapping[str, Any], *path: str) -> Estimate:
-    """Mean over members of their means over checkpoints, and its interval.
+def over_members(cell: Mapping[str, Any], *path: str, raw: bool = False) -> Estimate:
+    """Mean over members of their means over checkpoints, and its interval; geometric of ratios.
 
     Args:
       path: of the value in a checkpoint's estimates.
     """
-    means = []
+    ratio = path[-1] == "variance_ratio"
+    means: list[float] = []
     for member in cell["members"]:
-        values = [value for point in member["points"] if (value := _value(point, path)) is not None]
+        found = (_value(point, path, raw) for point in member["points"])
+        values = [value for value in found if value is not None]
         if values:
-            means.append(np.mean(values))
+            means.append(_mean(values, geometric=ratio)[0])
     if not means:
         return Estimate(None, None, None)
-    mean, low, high = (float(x[0]) for x in mean_interval(np.array(means)[:, None]))
+    mean, low, high = _mean(means, geometric=ratio)
     return Estimate(mean, None, None) if len(means) < 2 else Estimate(mean, low, high)
 
 
-def _value(point: Mapping[str, Any], path: Sequence[str]) -> float | None:
-    found: Any = rule(point)
+def _value(point: Mapping[str, Any], path: Sequence[str], raw: bool = False) -> float | None:
+    found: Any = rule(point, raw)
     for key in path:
         found = None if found is None else found[key]
     return None if found is None else found[0]
@@ -95,7 +111,7 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
     """The head, and a row for each task and arm."""
     rows = [list(HEAD)]
     for cell in measured["cells"]:
-        rates = [point["keep_rate"] for m in cell["members"] for point in m["points"]]
+        rates = [point["keep_rate"] for point in _points(cell)]
         used = sum(any(rule(p) for p in m["points"]) for m in cell["members"])
         values = [
             *(over_members(cell, "groups", name, "snr") for name in ("kept", "coin", "dropped")),
@@ -103,16 +119,34 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
             over_members(cell, "differences", "dropped - shifted", "snr"),
             over_members(cell, "differences", "kept - coin", "snr_per_env_step"),
             over_members(cell, "differences", "dropped - coin", "cosine"),
-            over_members(cell, "groups", "kept", "alignment"),
         ]
         ratios = [
-            interval(over_members(cell, "differences", pair, "variance_ratio"), 3)
-            for pair in ("dropped - coin", "kept - coin")
-        ]
+            _ratio(cell, "kept - coin"),
+            *(_ratio(cell, pair, raw=True)
+              for pair in ("kept - coin", "dropped - coin", "dropped - shifted")),
+        ]  # fmt: skip
         rate = f"{np.mean(rates):.2f}" if rates else "-"
         rows.append([cell["task"], cell["label"], f"{used} of {len(cell['members'])}", rate,
-                     *map(shown, values), *ratios])  # fmt: skip
+                     *map(shown, values), _alignment(cell), *map(shown_ratio, ratios)])  # fmt: skip
     return rows
+
+
+def _ratio(cell: Mapping[str, Any], pair: str, raw: bool = False) -> Estimate:
+    return over_members(cell, "differences", pair, "variance_ratio", raw=raw)
+
+
+def _alignment(cell: Mapping[str, Any]) -> str:
+    """That of the kept, and at how many of the measured checkpoints it is known."""
+    path = ("groups", "kept", "alignment")
+    values = [_value(point, path) for point in _points(cell) if rule(point)]
+    known = sum(value is not None for value in values)
+    return f"{shown(over_members(cell, *path))}, {known} of {len(values)}"
+
+
+def shown_ratio(estimate: Estimate) -> str:
+    """Three decimals where it is about 1, else as `shown`."""
+    near = estimate.high is not None and 0.5 < estimate.high < 2
+    return interval(estimate, 3) if near else shown(estimate)
 
 
 def shown(estimate: Estimate) -> str:
@@ -133,7 +167,7 @@ def verdicts(measured: Mapping[str, Any]) -> list[str]:
 
 
 def _verdict(cell: Mapping[str, Any]) -> str:
-    points = [point for member in cell["members"] for point in member["points"]]
+    points = [*_points(cell)]
     measured = [point for point in points if rule(point)]
     where = f"{cell['task']}, {cell['label']}"
     if not measured:
@@ -141,24 +175,29 @@ def _verdict(cell: Mapping[str, Any]) -> str:
                 f"{len(points)} checkpoints.")  # fmt: skip
     difference = over_members(cell, "differences", "dropped - coin", "snr")
     dropped, coin = (over_members(cell, "groups", name, "snr") for name in ("dropped", "coin"))
-    if difference.low is None or difference.high is None:
-        kind = "too few members to say whether what is dropped is noisier than what a coin drops"
-    elif difference.high < 0:
-        kind = "what the filter drops is noisier than what a coin drops"
-    elif difference.low > 0:
-        kind = "what the filter drops is less noisy than what a coin drops"
-    else:
-        kind = "no evidence that what the filter drops is noisier than what a coin drops"
+    ratio, kept = _ratio(cell, "dropped - coin", raw=True), _ratio(cell, "kept - coin")
     means = [shown(Estimate(found.value, None, None)) for found in (dropped, coin)]
     text = (
-        f"{where}: {kind} (signal to noise {means[0]} against {means[1]} per minibatch of "
-        f"{measured[0]['minibatch']}; difference {shown(difference)})."
+        f"{where}: by variance what the filter drops {_kind(ratio, 1.0, noisier=1)} what a coin "
+        f"drops ({shown_ratio(ratio)} times a coin's, advantages raw); by signal to noise it "
+        f"{_kind(difference, 0.0, noisier=-1)} that ({means[0]} against {means[1]} per minibatch "
+        f"of {measured[0]['minibatch']}, difference {shown(difference)}). As trained, minibatches "
+        f"of what it keeps have {shown_ratio(kept)} times the variance of a coin's."
     )
     if len(measured) < len(points):
         text += (
             f" At {len(points) - len(measured)} of {len(points)} checkpoints it dropped too few."
         )
     return text
+
+
+def _kind(estimate: Estimate, equal: float, noisier: int) -> str:
+    """What an interval says of the dropped; `noisier` is the side of `equal` that means it."""
+    if estimate.low is None or estimate.high is None:
+        return "is of too few members to be told from"
+    if estimate.low <= equal <= estimate.high:
+        return "is not told from"
+    return "is noisier than" if (estimate.low > equal) == (noisier > 0) else "is less noisy than"
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
@@ -184,15 +223,30 @@ def _line(cell: Mapping[str, Any], group: str, key: str) -> Line:
     seeds = []
     at: dict[float, list[float]] = {}
     for member in cell["members"]:
-        values = {p["point"]: _value(p, ("groups", group, key)) for p in member["points"]}
+        values = {point["point"]: _drawn(point, group, key) for point in member["points"]}
         seeds.append((member["seed"], [x * cell["steps"] for x in values], [*values.values()]))
-        for point, value in values.items():
+        for x, value in values.items():
             if value is not None:
-                at.setdefault(point, []).append(value)
+                at.setdefault(x, []).append(value)
     x = sorted(at)
-    lines = [[float(v[0]) for v in mean_interval(np.array(at[point])[:, None])] for point in x]
+    lines = [_mean(at[point], geometric=key == "variance") for point in x]
     y, low, high = (
         [None if np.isnan(value) else value for value in column]
         for column in zip(*lines, strict=True)
     )
     return Line(group, [point * cell["steps"] for point in x], y, low, high, seeds)
+
+
+def _drawn(point: Mapping[str, Any], group: str, key: str) -> float | None:
+    """What a figure shows of a group at a checkpoint: of its variance the ratio to the coin's."""
+    if key != "variance":
+        return _value(point, ("groups", group, key))
+    own, coin = (_value(point, ("groups", name, key), raw=True) for name in (group, "coin"))
+    return None if own is None or coin is None else own / coin
+
+
+def _mean(values: Sequence[float], geometric: bool) -> list[float]:
+    """The mean and its interval, NaN where there is none."""
+    x = np.log(values) if geometric else np.asarray(values)
+    ends = [float(end[0]) for end in mean_interval(x[:, None])]
+    return [float(np.exp(end)) for end in ends] if geometric else ends

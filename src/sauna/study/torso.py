@@ -177,6 +177,16 @@ def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
     return []
 
 
+def chosen(measured: Mapping[str, Any]) -> str:
+    """How the pair that is shown was chosen, and how usual it is."""
+    pair = next(pair for pair in pairs(measured) if pair.seeds)
+    return (
+        f"Chosen for the contrast: the first seed of which only {pair.label} is on its feet "
+        f"({pair.gained} of {pair.seeds}; only {pair.baseline} in {pair.lost})"
+        f"{'' if pair.gained else ', failing that the first of all'}."
+    )
+
+
 def _figure(measured: Mapping[str, Any], place: Path) -> str:
     """The strip of stills as HTML, or why there is none."""
     pair = shown_pair(measured)
@@ -188,9 +198,8 @@ def _figure(measured: Mapping[str, Any], place: Path) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
     text = escape(", ".join(f"{label} seed {one.seed}, {_posture(one)}" for label, one in pair))
     return (
-        f'<figure id="stills"><figcaption>One pair at equal times, in env steps: {text}. The first '
-        f"seed whose postures differ that way, or the first of all; of each its clearest "
-        f"episode in that posture.</figcaption>"
+        f'<figure id="stills"><figcaption>One pair at equal times, in env steps: {text}. '
+        f"{escape(chosen(measured))} Of each its clearest episode in that posture.</figcaption>"
         f'<div class="wide" role="region" tabindex="0" aria-label="Stills"><img alt="Stills of '
         f'{text}" style="display:block;width:100%;min-width:48rem;background:#fff" '
         f'src="data:image/png;base64,{data}"></div></figure>'
@@ -207,7 +216,8 @@ def plots(measured: Mapping[str, Any]) -> list[Plot]:
         x, y = one.curve["env_steps"], one.curve["explained_variance"]
         lines.append(Line(label, x, y, [None] * len(x), [None] * len(x), []))
     said = escape(", ".join(f"{label} {_posture(one)}" for label, one in pair))
-    caption = f"Of one pair of seeds: {said}. The axis is cut at -1."
+    caption = (f"Of one pair of seeds: {said}. {chosen(measured)} Over the env steps that an "
+               f"update learned from, which a filter chooses. The axis is cut at -1.")  # fmt: skip
     panel = Panel(f"{measured['cells'][0]['task']}, seed {pair[0][1].seed}", lines)
     return [
         Plot("pair", "Explained variance of one pair", caption, "env steps", "explained variance",
