@@ -15,7 +15,7 @@ import numpy as np
 
 from sauna.study.numbers import interval
 from sauna.study.statistics import Estimate, compare, improvement_over_tasks
-from sauna.study.summary import UNFILTERED
+from sauna.study.summary import MORE_STEPS, UNFILTERED
 from sauna.study.tables import PAPER, unversioned
 
 VARIANTS = ("sauna", "sauna 0.8", "sauna-paper")
@@ -70,21 +70,40 @@ def claims_rows(results: Mapping[str, Any]) -> list[list[str]]:
                     baseline,
                     *_judged(pairs, keep_rates, label != "vex-head"),
                 ]
+                row[-1] += _circumstances(cells)
                 if len(pairs) < studied:
                     row[-1] += f" ({len(pairs)} of {studied} tasks so far)"
                 rows.append(row)
     return rows
 
 
+def _circumstances(cells: list[tuple[dict[str, Any], dict[str, Any]]]) -> str:
+    """What else a difference may come from: seeds that are left out, and more env steps."""
+    said = ""
+    failed = sum(
+        m["status"] == "failed" for pair in cells for cell in pair for m in cell["members"]
+    )
+    if failed:
+        said += f"; {failed} failed seeds are left out"
+    ratios = [_scores(own, "env_steps").mean() / _scores(base, "env_steps").mean()
+              for own, base in cells]  # fmt: skip
+    if max(ratios) > 1 + MORE_STEPS:
+        said += f"; it took up to {max(ratios):.2f} times the env steps"
+    return said
+
+
 def told(rows: list[list[str]]) -> list[str]:
-    """A sentence for each claim, from its rows."""
+    """A sentence for each claim, from its rows; an arm beside another than the first says which."""
     sentences = []
     for text, of_claim in itertools.groupby(rows, key=lambda row: row[0]):
-        arms: dict[str, list[str]] = {}
+        arms: dict[tuple[str, str], list[str]] = {}
+        usual = next(claim.pairs[0][1] for claim in CLAIMS if claim.text == text)
         for row in of_claim:
-            arms.setdefault(row[-1], []).append(row[1])
+            beside = "" if row[2] == usual else f" (against `{row[2]}`)"
+            arms.setdefault((beside, row[-1]), []).append(row[1])
         found = (
-            f"{', '.join(f'`{label}`' for label in labels)}: {so}" for so, labels in arms.items()
+            f"{', '.join(f'`{label}`' for label in labels)}{beside}: {so}"
+            for (beside, so), labels in arms.items()
         )
         sentences.append(f"**{text}.** {'. '.join(found)}.")
     return sentences

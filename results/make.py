@@ -31,7 +31,7 @@ from sauna.study.page import rounded
 from sauna.study.report import UNFOLDED
 from sauna.study.results import gather
 from sauna.study.spec import load_spec
-from sauna.study.summary import summarize
+from sauna.study.summary import FILTERING, summarize
 from sauna.study.tables import PAPER, unversioned
 from sauna.study.units import units_of
 
@@ -95,7 +95,9 @@ def _thinned(cell: dict[str, Any]) -> dict[str, Any]:
     members = [m for m in cell["members"] if m["status"] in ("complete", "failed")]
     for member in members:
         curve, number = member["curve"], len(member["curve"]["env_steps"])
-        chosen = np.unique(np.linspace(0, number - 1, POINTS).astype(int)).tolist()
+        chosen = (
+            np.unique(np.linspace(0, number - 1, POINTS).astype(int)).tolist() if number else []
+        )
         member["curve"] = {key: [curve[key][i] for i in chosen] for key in ("env_steps", *CURVES)}
     return {**cell, "members": members}
 
@@ -203,6 +205,9 @@ def document() -> str:
         parts.append(_missing(name, results))
         parts.append(shown_figures(name))
         parts.append(_verdicts(summary["verdicts"]))
+        if summary["filtering"]:
+            parts += [f"Is it the filter? {FILTERING}", _verdicts(summary["filtering"])]
+        parts.append(_same_runs(results))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -218,6 +223,35 @@ def _verdicts(found: list[dict[str, Any]]) -> str:
         f"Of {len(found)} comparisons, {len(decided)} are decided.\n\n{_listed(decided)}\n\n"
         f"{_folded(f'The other {len(others)}', others)}"
     )
+
+
+def _same_runs(results: dict[str, Any]) -> str:
+    """Arms whose runs of every seed agree wherever both have a point: evidence that counts once."""
+    said = []
+    for task in dict.fromkeys(cell["task"] for cell in results["cells"]):
+        cells = [cell for cell in results["cells"] if cell["task"] == task]
+        said += [f"On {task} `{a['label']}` and `{b['label']}` are the same runs up to where each "
+                 f"stops: what both are said to show was seen once."
+                 for a, b in itertools.combinations(cells, 2) if _agree(a, b)]  # fmt: skip
+    return _listed(said)
+
+
+def _agree(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    curves = [
+        {
+            m["seed"]: dict(zip(m["curve"]["env_steps"], m["curve"]["return_mean"], strict=True))
+            for m in cell["members"]
+        }
+        for cell in (a, b)
+    ]
+    if not curves[0] or set(curves[0]) != set(curves[1]):
+        return False
+    for seed, one in curves[0].items():
+        other = curves[1][seed]
+        both = [step for step in set(one) & set(other) if one[step] is not None]
+        if len(both) < 3 or any(one[step] != other[step] for step in both):
+            return False
+    return True
 
 
 def _folded(name: str, sentences: Iterable[str]) -> str:

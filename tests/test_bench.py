@@ -96,6 +96,12 @@ def test_the_report_shows_every_figure() -> None:
     "arguments, message",
     [
         (["--against", "sb4"], "unknown peer 'sb4'"),
+        (["--against", "sb3", "--epochs", "1"], "epochs: not read by sb3"),
+        (["--against", "sb3", "--env-kwargs", '{"a": 1}'], "env_kwargs: not read by sb3"),
+        (["--against", "sb3", "--preset", "mujoco-release"], "settings of mujoco, not of mujoco-r"),
+        (["--against", "sb3", "--algorithm", "a2c"], "settings of a2c-mujoco, not of a2c"),
+        (["ALE/Pong-v5", "--against", "sb3"], "settings of atari, not of mujoco"),
+        (["ALE/Pong-v5", "--against", "sb3", "--preset", "a2c-atari"], "sb3 is run with PPO"),
         (["--rounds", "0"], "rounds: must be"),
         (["NoSuch-v0"], "unknown environment"),
         (["--json", "nowhere/x.json"], "is not a folder"),

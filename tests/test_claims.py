@@ -15,7 +15,8 @@ TASKS = ("A-v5", "B-v5", "C-v5")
 
 
 def cell(task: str, label: str, scores: np.ndarray, keep_rate: float = 1.0) -> dict[str, Any]:
-    members = [{"status": "complete", "final_return": x, "area": -x, "keep_rate": keep_rate}
+    members = [{"status": "complete", "final_return": x, "area": -x, "keep_rate": keep_rate,
+                "env_steps": 1000.0}
                for x in scores.tolist()]  # fmt: skip
     return {"task": task, "label": label, "members": members}
 
@@ -97,12 +98,29 @@ def test_no_credit_where_it_filtered_nothing_on_the_task_it_won() -> None:
 def test_failed_seeds_count_as_ended_and_never_as_scores() -> None:
     results = study((HIGH, HIGH, HIGH))
     results["cells"][-1]["members"][0] |= {"status": "failed", "final_return": None}
-    assert said(results)["so"] == "better on A, B, C; better over the tasks by the interval"
+    assert said(results)["so"] == (
+        "better on A, B, C; better over the tasks by the interval; 1 failed seeds are left out"
+    )
+
+
+def test_more_env_steps_are_told() -> None:
+    results = study((HIGH, HIGH, HIGH))
+    for steps, told_ in (
+        (1020.0, "; it took up to 1.02 times the env steps"),
+        (1010.0, "interval"),
+    ):
+        for member in results["cells"][-1]["members"]:
+            member["env_steps"] = steps
+        assert said(results)["so"].endswith(told_)
 
 
 def test_a_sentence_for_each_claim() -> None:
-    rows = [["A", "x", "-", "holds"], ["A", "y", "-", "not decided"], ["A", "z", "-", "holds"]]
-    assert told([*rows, ["B", "x", "-", "holds"]]) == [
-        "**A.** `x`, `z`: holds. `y`: not decided.",
-        "**B.** `x`: holds.",
+    """An arm beside another than the claim's first pair has names it."""
+    first, second = CLAIMS[0].text, CLAIMS[3].text
+    rows = [[first, "x", "ppo", "holds"], [first, "y", "ppo", "not decided"],
+            [first, "z", "ppo", "holds"], [first, "r", "ppo, limits end", "holds"],
+            [second, "x", "ppo", "holds"]]  # fmt: skip
+    assert told(rows) == [
+        f"**{first}.** `x`, `z`: holds. `y`: not decided. `r` (against `ppo, limits end`): holds.",
+        f"**{second}.** `x`: holds.",
     ]

@@ -36,7 +36,7 @@ def test_coverage_is_the_entropy_of_what_is_known() -> None:
 def cell(label: str, values: list[float], **settings: Any) -> dict[str, Any]:
     """Members whose entropy and coverage are `values`, and their returns the negative."""
     config = {"threshold": 0.3, "threshold_schedule": "constant", "keep_rate_target": 0.0}
-    own = {"task": "A-v0", "label": label, "arm": "sauna", "rates_of": None}
+    own = {"task": "A-v0", "label": label, "arm": "sauna", "rates_of": None, "seeds": len(values)}
     own |= {key: settings.pop(key) for key in list(settings) if key in own}
     members = [
         {"seed": seed, "keep_rate": 0.5, "final_return": -x, "entropy": x, "threshold": 0.9,
@@ -69,7 +69,8 @@ def test_an_arm_is_told_apart_from_its_coin_pair_by_pair() -> None:
     """Entropy and coverage of the coins lie 0.2 below, seed by seed; or not at all."""
     for gaps, said in (
         ([0.2, 0.2, 0.2], "told apart by entropy and coverage and return (threshold minus coin: "
-         "entropy 0.20 [0.20, 0.20], coverage 0.20 [0.20, 0.20], return -0.20 [-0.20, -0.20])"),
+         "entropy 0.20 [0.20, 0.20], coverage 0.20 [0.20, 0.20], return -0.20 [-0.20, -0.20]; "
+         "3 pairs)."),
         ([0.2, -0.3, 0.1], "are not told apart (threshold minus coin: entropy 0.0"),
     ):  # fmt: skip
         values = [x - gap for x, gap in zip([0.5, 0.6, 0.4], gaps, strict=True)]
@@ -78,7 +79,10 @@ def test_an_arm_is_told_apart_from_its_coin_pair_by_pair() -> None:
         assert len(told) == 2 and said in told[1], told[1]
         assert told[1].startswith("A-v0: threshold 0.5 and a coin that drops as much are ")
     few = cell("coin", [0.1], arm="random-drop", rates_of="0.5")
-    assert "not told apart" in verdicts(study(*RISING, few))[1]
+    assert "have too few pairs yet" in verdicts(study(*RISING, few))[1]
+    assert "; 9 members." in verdicts(study(*RISING))[0]
+    part = [*RISING[:2], {**RISING[2], "seeds": 4}]
+    assert "; 9 members of 10 so far." in verdicts(study(*part))[0]
 
 
 def test_the_p_value_is_that_of_all_deals() -> None:

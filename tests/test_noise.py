@@ -271,7 +271,8 @@ def point(at: float, snr: float, coin: float = 0.010, raw: float = 1.0) -> dict[
 
 def measured(*members: list[dict[str, Any]]) -> dict[str, Any]:
     listed = [{"seed": seed, "points": points} for seed, points in enumerate(members)]
-    cell = {"task": "A-v0", "label": "sauna", "arm": "sauna", "steps": 1000, "members": listed}
+    cell = {"task": "A-v0", "label": "sauna", "arm": "sauna", "steps": 1000, "members": listed,
+            "seeds": len(listed)}  # fmt: skip
     return {"name": "noise", "measure": "noise", "cells": [cell]}
 
 
@@ -316,6 +317,15 @@ def test_an_alignment_says_how_many_checkpoints_it_is_known_at() -> None:
     unknown["rules"]["standardized"]["groups"]["kept"]["alignment"] = [None, None, None]
     head, row = text_table(measured([point(0.5, 0.01), unknown], [point(0.5, 0.01)]))
     assert row[head.index("Alignment of kept")] == "1.0 [1.0, 1.0], 2 of 3"
+
+
+def test_what_is_not_measured_yet_is_told() -> None:
+    part = measured([], [])
+    assert verdicts(part) == ["A-v0, sauna: not measured yet."]
+    part = measured([point(0.5, 0.01)], [point(0.5, 0.02)], [])
+    assert verdicts(part)[0].endswith("2 of 3 seeds so far.")
+    assert text_table(part)[1][2] == "2 of 3"
+    assert "so far" not in verdicts(measured([point(0.5, 0.01)]))[0]
 
 
 def test_where_nothing_was_dropped_nothing_is_said() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,8 @@ TWO = {"tasks": ["A-v0"], "seeds": 3, "steps": 10_000, "rollout_steps": 1000, "m
 class Broken(Executor):
     """Every unit ends at once: complete, unless it trains seed 1 or its name is in `crashes`."""
 
+    unlucky: int | None = 1
+
     def __init__(self, folder: Path, view: StudyView, crashes: tuple[str, ...] = ()) -> None:
         super().__init__(folder, 2, view, lambda: False)
         self.starts: Counter[str] = Counter()
@@ -31,7 +34,7 @@ class Broken(Executor):
         for name, unit in list(self._running.items()):
             if name in self._left:
                 self._left.remove(name)
-            elif 1 not in unit.seeds:
+            elif self.unlucky not in unit.seeds:
                 unit.run(self._folder).mkdir(parents=True)
                 rundir.write_json(unit.run(self._folder) / "summary.json", {"complete": True})
             self._end(name, "broken")
@@ -63,6 +66,21 @@ def test_a_unit_is_continued_once_and_then_each_of_its_seeds_trained_once(tmp_pa
 def test_one_that_crashed_once_is_continued_and_not_split(tmp_path: Path) -> None:
     executor, (ppo, _) = run(tmp_path, {**TWO, "seeds": [0, 2]}, crashes=(0,))
     assert executor.starts[ppo.name] == 2 and not list(tmp_path.rglob("split.json"))
+
+
+def test_a_coin_tries_again_with_its_source(tmp_path: Path, monkeypatch) -> None:
+    """The seed's folder is removed, as the documentation says, and only that of the source."""
+    arms = [{"label": "sauna"}, {"label": "random-drop"}]
+    _, (sauna, coin) = run(tmp_path, {**TWO, "arms": arms})
+    places = [tmp_path / unit.name / "seed-1" for unit in (sauna, coin)]
+    assert all((place / "failed.json").exists() for place in places)
+    executor, _ = run(tmp_path, {**TWO, "arms": arms})
+    assert not executor.starts  # nothing was removed
+    shutil.rmtree(places[0])
+    monkeypatch.setattr(Broken, "unlucky", None)
+    run(tmp_path, {**TWO, "arms": arms})
+    assert all(rundir.is_complete(place / "run") for place in places)
+    assert not list(tmp_path.rglob("failed.json"))
 
 
 def test_two_labels_of_the_same_settings_are_one_unit(tmp_path: Path) -> None:

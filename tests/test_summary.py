@@ -175,6 +175,34 @@ def test_several_arms_are_corrected_together() -> None:
     assert "The interval leaves out 0.5, but the test, which decides, does not." in both["text"]
 
 
+def test_the_filter_is_held_against_the_head_alone_and_its_coin() -> None:
+    """All three beat the baseline; what the head alone does is no merit of the filter."""
+    coin = {**cell("coin", ALIKE, arm="random-drop", keep_rate=0.7), "rates_of": "sauna"}
+    other = {**cell("other coin", LOW, arm="random-drop", keep_rate=0.7), "rates_of": "elsewhere"}
+    arms = [cell("ppo", [0.0] * 6), cell("vex-head", LOW), other, coin,
+            cell("sauna", HIGH, keep_rate=0.7)]  # fmt: skip
+    found = summarize(results(*arms))
+    assert [v["kind"] for v in found["verdicts"]] == ["better"] * 4
+    told = {v["against"]: v for v in found["filtering"]}
+    assert set(told) == {"vex-head", "coin"}
+    assert [(v["label"], v["kind"]) for v in told.values()] == [("sauna", "better")] * 2
+    assert "sauna: better than coin on Cheetah" in told["coin"]["text"]
+    assert "exact p = 0.004 after Holm's correction for 2 comparisons" in told["coin"]["text"]
+    arms[-1] = cell("sauna", ALIKE, keep_rate=0.7)
+    found = summarize(results(*arms))
+    assert found["verdicts"][-1]["kind"] == "better"
+    assert {v["kind"] for v in found["filtering"]} == {"no evidence"}
+    assert summarize(results(*arms[:2]))["filtering"] == []
+    ruled = {**cell("sauna", HIGH, keep_rate=0.7), "baseline": "ppo, other rules"}
+    assert summarize(results(*arms[:2], ruled))["filtering"] == []  # another head, of other rules
+
+
+def test_a_baseline_that_filtered_nothing_is_told() -> None:
+    stored = {**results(cell("sauna", LOW, keep_rate=1.0), cell("ppo", HIGH)), "baseline": "sauna"}
+    text = summarize(stored)["verdicts"][0]["text"]
+    assert "sauna dropped none of its steps, so no difference can be credited" in text
+
+
 def test_words_and_intervals_agree_on_random_studies() -> None:
     """No interval that holds 0.5, as printed, stands beside `better` or `worse`."""
     random = np.random.default_rng(0)

@@ -24,11 +24,16 @@ from sauna.bench.rates import (
     training_rate,
 )
 from sauna.bench.scale import scale
+from sauna.config import FIELDS, Config
 from sauna.errors import BadInput
-from sauna.presets import resolve
+from sauna.presets import arm_config, resolve
 from sauna.run import plain
 
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
+_FIELDS = [*FIELDS]
+# The settings of environment and learning, which a trainer without filters has as well.
+_LEARNING = ("env_kwargs", "truncation",
+             *_FIELDS[_FIELDS.index("envs") : _FIELDS.index("clip_rewards") + 1])  # fmt: skip
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 
 
@@ -76,8 +81,7 @@ def bench(
         "git": rundir.git_revision(),
     }
     if against:
-        if script and config.algorithm != "ppo":
-            raise BadInput(f"against: {against} is run with PPO, not with {config.algorithm}")
+        _check_peer(config, given, against)
         python = prepare(against, say)
         measures[against] = partial(
             peer_rate, python, script, config.env, config.algorithm, processes, SECONDS
@@ -94,6 +98,27 @@ def bench(
     result["split"] = _split_elsewhere({**given, "steps": batch * 100}, share)
     result |= start_and_memory(given)
     return result
+
+
+def _check_peer(config: Config, given: Mapping[str, Any], against: str) -> None:
+    """Refuses settings of learning that a peer, which has those of one preset, would not read.
+
+    Arms and filters are not among them: what they cost beside a peer's PPO is a fair question.
+
+    Raises:
+      BadInput: naming the field.
+    """
+    atari = config.env.startswith("ALE/")
+    if config.algorithm != "ppo" and (against != "sb3" or atari):
+        raise BadInput(f"against: {against} is run with PPO, not with {config.algorithm}")
+    preset = "atari" if atari else "mujoco" if config.algorithm == "ppo" else "a2c-mujoco"
+    if config.preset != preset:
+        raise BadInput(f"preset: {against} runs {config.env} with the settings of {preset}, not of "
+                       f"{config.preset}")  # fmt: skip
+    usual = arm_config("ppo", {"preset": preset})
+    for name in (name for name in given if name in _LEARNING):
+        if getattr(config, name) != getattr(usual, name):
+            raise BadInput(f"{name}: not read by {against}, which runs the preset {preset}")
 
 
 def bench_scale(

@@ -27,7 +27,7 @@ from sauna.study.numbers import digits_of_tasks, interval, number
 from sauna.study.results import gather, typed
 from sauna.study.schedule import Executor
 from sauna.study.spec import Spec, check, load_spec, read_spec
-from sauna.study.summary import summarize
+from sauna.study.summary import FILTERING, summarize
 from sauna.study.units import (
     Unit,
     digest_of,
@@ -285,7 +285,10 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
-    said = [*(v["text"] for v in summary["verdicts"]), *summary.get("measured", [])]
+    said = [v["text"] for v in summary["verdicts"]]
+    if summary["filtering"]:
+        said += ["", "Is it the filter? " + FILTERING, *(v["text"] for v in summary["filtering"])]
+    said += summary.get("measured", [])
     return [*(line.rstrip() for line in table), "", *said]
 
 

@@ -54,6 +54,7 @@ class Mark(NamedTuple):
     kind: str  # of `LOOKS`
     label: str
     threshold: float  # of a coin, that of the arm whose rates it repeats
+    seeds: int  # that the arm has, trained and measured or not
     members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
     drops_like: str | None = None  # of a coin, the arm whose drop rates it repeats
 
@@ -86,7 +87,9 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
         stands_for = cell["rates_of"] if kind.startswith("coin") else cell["label"]
         threshold = thresholds.get(stands_for)
         if threshold is not None:
-            found.append(Mark(kind, cell["label"], threshold, numbers, cell["rates_of"]))
+            found.append(
+                Mark(kind, cell["label"], threshold, cell["seeds"], numbers, cell["rates_of"])
+            )
     return found
 
 
@@ -132,7 +135,7 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
     rows = [["Task", "Arm", "Members", "Threshold", *names]]
     for task in tasks_of(measured):
         for mark in marks(measured, task):
-            number = str(len(mark.members["final_return"]))
+            number = f"{len(mark.members['coverage'])} of {mark.seeds}"
             values = [shown(over_members(mark, key)) for key, *_ in QUANTITIES]
             rows.append([task, mark.label, number, f"{mark.threshold:.3g}", *values])
     return rows
@@ -177,6 +180,12 @@ def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
     for coin in found:
         if coin.drops_like not in arms:
             continue
+        pairs = len({seed for seed, _ in arms[coin.drops_like].members["coverage"]}
+                    & {seed for seed, _ in coin.members["coverage"]})  # fmt: skip
+        if pairs < 2:
+            yield f"{task}: threshold {coin.drops_like} and a coin that drops as much have too " \
+                  f"few pairs yet."  # fmt: skip
+            continue
         said, apart = [], []
         for key, name, *_ in QUANTITIES:
             if key in ASKED:
@@ -186,7 +195,7 @@ def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
                     apart.append(name)
         kind = f"told apart by {' and '.join(apart)}" if apart else "not told apart"
         yield f"{task}: threshold {coin.drops_like} and a coin that drops as much are {kind} " \
-              f"(threshold minus coin: {', '.join(said)})."  # fmt: skip
+              f"(threshold minus coin: {', '.join(said)}; {pairs} pairs)."  # fmt: skip
 
 
 def _verdict(task: str, found: Sequence[Mark]) -> str:
@@ -214,8 +223,9 @@ def _verdict(task: str, found: Sequence[Mark]) -> str:
     else:
         dial = "no evidence that the threshold is a dial of exploration: entropy and coverage do " \
                "not both follow it one way"  # fmt: skip
-    number = known["entropy"][2]
-    return f"{task}: {dial}. With a rising threshold {'; '.join(said)}; {number} members."
+    number, wanted = known["coverage"][2], sum(m.seeds for m in found if m.kind == "constant")
+    so_far = "" if number == wanted else f" of {wanted} so far"
+    return f"{task}: {dial}. With a rising threshold {'; '.join(said)}; {number} members{so_far}."
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:

@@ -187,7 +187,8 @@ def gather_measured(
 ) -> dict[str, Any]:
     """What has been measured so far, beside the numbers of `results` that it is set against.
 
-    Every cell of `results` is there, and of each complete member its `points`: none of a member
+    Every cell of `results` with a complete member that can be measured is there, and of each such
+    member its `points`: none of a member
     whose later checkpoints are still to be measured, since early ones alone would pass for all.
     """
     points: dict[tuple[str, str, int], list[dict[str, Any]]] = {}

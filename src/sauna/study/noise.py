@@ -126,7 +126,7 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
               for pair in ("kept - coin", "dropped - coin", "dropped - shifted")),
         ]  # fmt: skip
         rate = f"{np.mean(rates):.2f}" if rates else "-"
-        rows.append([cell["task"], cell["label"], f"{used} of {len(cell['members'])}", rate,
+        rows.append([cell["task"], cell["label"], f"{used} of {cell['seeds']}", rate,
                      *map(shown, values), _alignment(cell), *map(shown_ratio, ratios)])  # fmt: skip
     return rows
 
@@ -170,6 +170,8 @@ def _verdict(cell: Mapping[str, Any]) -> str:
     points = [*_points(cell)]
     measured = [point for point in points if rule(point)]
     where = f"{cell['task']}, {cell['label']}"
+    if not points:
+        return f"{where}: not measured yet."
     if not measured:
         return (f"{where}: no answer, because the filter dropped too few steps at each of "
                 f"{len(points)} checkpoints.")  # fmt: skip
@@ -188,7 +190,8 @@ def _verdict(cell: Mapping[str, Any]) -> str:
         text += (
             f" At {len(points) - len(measured)} of {len(points)} checkpoints it dropped too few."
         )
-    return text
+    number = sum(bool(member["points"]) for member in cell["members"])
+    return text if number == cell["seeds"] else f"{text} {number} of {cell['seeds']} seeds so far."
 
 
 def _kind(estimate: Estimate, equal: float, noisier: int) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 from sauna.study import tables
 from sauna.study.figures import NOTHING, Extra, Panel, Plot, looks_of, plots_of, write_figures
 from sauna.study.page import filled, rounded
+from sauna.study.summary import FILTERING
 from sauna.style import Look, short
 
 # A shape beside the colour of each kind of verdict.
@@ -69,6 +70,7 @@ def make_page(
         if extra.title
         else "",
         verdicts=verdicts(summary),
+        filtering=filtering(summary),
         table=tables.main_table(results, summary),
         over_tasks=tables.over_tasks(results, summary),
         metric=escape(results["metric"]),
@@ -111,12 +113,30 @@ def verdicts(summary: Mapping[str, Any]) -> str:
         return "<p>Nothing is compared: there is no arm beside the baseline.</p>"
     if len(found) <= UNFOLDED:
         return _sentences(found)
+    return f"{_counted(found)}{_grid(summary)}{_folds(found)}"
+
+
+def filtering(summary: Mapping[str, Any]) -> str:
+    """The verdicts on the filter alone, if an arm stands beside one that says so."""
+    found = summary["filtering"]
+    if not found:
+        return ""
+    listed = _sentences(found) if len(found) <= UNFOLDED else _counted(found) + _folds(found)
+    return f"<h3>Is it the filter?</h3><p>{FILTERING}</p>{listed}"
+
+
+def _counted(found: Sequence[Mapping[str, Any]]) -> str:
+    return f"<p>{_plural(len(found), 'comparison')}: {_totals(found)}.</p>"
+
+
+def _folds(found: Sequence[Mapping[str, Any]]) -> str:
+    """What each verdict rests on, folded away task by task."""
     folds = ""
     for task in dict.fromkeys(verdict["task"] for verdict in found):
         of_task = [verdict for verdict in found if verdict["task"] == task]
         name = f"{escape(task)}: {_totals(of_task)}"
         folds += f"<details><summary>{name}</summary>{_sentences(of_task)}</details>\n"
-    return f"<p>{_plural(len(found), 'comparison')}: {_totals(found)}.</p>{_grid(summary)}{folds}"
+    return folds
 
 
 def _totals(found: Sequence[Mapping[str, Any]]) -> str:
@@ -127,7 +147,8 @@ def _totals(found: Sequence[Mapping[str, Any]]) -> str:
 def _sentences(found: Sequence[Mapping[str, Any]]) -> str:
     items = "".join(
         f'<li class="{_class(v)}"><span class="kind"><span aria-hidden="true">{MARKS[v["kind"]]}'
-        f"</span> {escape(v['kind'])}</span> <b>{escape(v['label'])}</b> on {escape(v['task'])}"
+        f"</span> {escape(v['kind'])}</span> <b>{escape(v['label'])}</b> against "
+        f"{escape(v['against'])} on {escape(v['task'])}"
         f"<p>{escape(v['text'])}</p></li>\n"
         for v in found
     )

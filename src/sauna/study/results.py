@@ -70,6 +70,7 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
         "label": arm.label,
         "arm": arm.arm,
         "baseline": arm.baseline,
+        "rates_of": arm.rates_of,
         "preset": config["preset"],
         "config": config,
         "command": f"sauna train {shlex.quote(task)} {text}",

@@ -11,6 +11,7 @@ from sauna import rundir
 from sauna.study.units import Unit, mark_split, needs_split, parts, split
 
 ATTEMPTS = 2  # a failed unit is continued once
+NO_RATES = "the arm whose drop rates it repeats failed"
 
 
 class View(Protocol):
@@ -47,6 +48,8 @@ class Executor(ABC):
     def run(self, units: list[Unit]) -> None:
         """Runs every unit that is neither complete nor failed; returns when all are, or stopped."""
         everything = [part for unit in units for part in parts(unit, self._folder)]
+        for unit in everything:
+            self._forgive(unit)
         self._waiting = [unit for unit in everything if not self._is_over(unit)]
         try:
             while self._waiting or self._running:
@@ -95,7 +98,7 @@ class Executor(ABC):
                 self._split(unit)
             elif self._source_failed(unit):
                 waiting.remove(unit)
-                self._give_up(unit, "the arm whose drop rates it repeats failed")
+                self._give_up(unit, NO_RATES)
             elif unit.source is None or self._is_ready(unit.source):
                 waiting.remove(unit)
                 self._running[unit.name] = unit
@@ -107,6 +110,11 @@ class Executor(ABC):
 
     def _source_failed(self, unit: Unit) -> bool:
         return unit.source is not None and (self._folder / unit.source / "failed.json").exists()
+
+    def _forgive(self, unit: Unit) -> None:
+        """Lets a coin try again whose source no longer counts as failed: somebody removed it."""
+        if unit.error(self._folder) == NO_RATES and not self._source_failed(unit):
+            (self._folder / unit.name / "failed.json").unlink()
 
     def _end(self, name: str, error: str) -> None:
         """A unit is no longer running; `error` says why, if it is not complete."""

@@ -92,6 +92,9 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
         raise BadInput("study: arms must be a list of tables")
     if not entries:
         raise BadInput("study: no arms")
+    for key in ("tasks", "seeds"):
+        if key in values and all(key in entry for entry in entries):
+            raise BadInput(f"study: {key} is read by none of the arms, which have their own")
     arms = [_read_arm(dict(entry), values, common) for entry in entries]
     _check_common(common, arms)
     labels = [arm.label for arm in arms]
@@ -125,8 +128,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
         raise BadInput("study: tasks must be a list of environments, each of them once")
     seeds = parse("seeds", entry.get("seeds", top.get("seeds", 6)))
     own = {key: value for key, value in entry.items() if key not in _ARM}
-    optional = {key: entry[key] and _text(entry[key], key) for key in ("baseline", "rates_of")
-                if key in entry}  # fmt: skip
+    optional = {key: _text(entry[key], key) for key in ("baseline", "rates_of") if key in entry}
     return Arm(
         _text(entry.get("label", arm), "label"), arm,
         {**{key: value for key, value in common.items() if reads(arm, {**common, **own}, key)},

@@ -32,6 +32,10 @@ FORMAT = 1
 GRID = 60  # points of a curve at most
 UNFILTERED = 0.99  # mean keep rate from which a difference is not credited to filtering
 MORE_STEPS = 0.01  # relative difference in env steps from which it is mentioned
+FILTERING = (
+    "Each arm that filters against what differs from it in the choice of steps alone: the head "
+    "without a filter, and a coin that drops as much."
+)
 MANY_SEEDS = 1000  # no estimate of a number of seeds is worth more digits
 # What a curve shows, and the values it can take at all: no interval claims more.
 QUANTITIES = {
@@ -53,6 +57,7 @@ class Cell(NamedTuple):
     failed: int
     running: int
     waiting: int
+    rates_of: str | None = None  # of a coin, the label whose drop rates it repeats
 
     def values(self, name: str) -> np.ndarray:
         """The finite values of a member's entry `name`, over complete members."""
@@ -84,6 +89,7 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
             for task, of_label in found.items()
             for verdict in _verdicts(of_task[task], of_label, len(of_task))
         ],
+        "filtering": [v for own in of_task.values() for v in _of_filtering(own, len(of_task))],
         "table": [_row(cell, found[cell.task].get(cell.label)) for cell in cells],
         "over_tasks": _over_tasks(of_task),
         "profiles": {task: _profiles(of_task[task]) for task in of_task},
@@ -100,8 +106,9 @@ def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
     )
     complete = [member for member in members if member["status"] == "complete"]
     return Cell(
-        stored["task"], stored["label"], stored["arm"], own, complete, failed, running, waiting
-    )
+        stored["task"], stored["label"], stored["arm"], own, complete, failed, running, waiting,
+        stored.get("rates_of"),
+    )  # fmt: skip
 
 
 def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
@@ -210,24 +217,66 @@ def _verdicts(
         absent = Cell(cell.task, str(cell.baseline), "", None, [], 0, 0, 0)
         base = of_label.get(str(cell.baseline), absent)
         family = sum(other.baseline == cell.baseline for other in cells)
-        sentences = [
-            _finding(cell, base, comparison, family),
-            *_limits(cell, base, comparison, tasks),
-            *_circumstances(cell, base),
-        ]
-        text = " ".join(filter(None, sentences))
-        verdicts.append({"task": cell.task, "label": label, "kind": comparison.kind, "text": text})
+        verdicts.append(_verdict(cell, base, comparison, _plural(family, "arm"), tasks))
     return verdicts
 
 
-def _finding(cell: Cell, base: Cell, comparison: Comparison, arms: int) -> str:
+def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, str]]:
+    """Each arm that filters against those that differ from it in the choice of steps alone.
+
+    These are the arm that trains the head and drops nothing, and the coin that drops as much. A
+    verdict against the baseline says what head, filter and fewer updates do together; these say
+    whether it is the filter. All of a task are one family of tests.
+    """
+    pairs = {
+        f"{cell.label} - {other.label}": (cell, other)
+        for cell in cells
+        for other in cells
+        if ARMS.get(cell.arm, {}).get("filter") == "sauna" and _is_control(other, cell)
+    }
+    found = compare({
+        name: (cell.values("final_return"), other.values("final_return"))
+        for name, (cell, other) in pairs.items()
+    })  # fmt: skip
+    family = _plural(len(pairs), "comparison")
+    return [_verdict(*pairs[name], comparison, family, tasks) for name, comparison in found.items()]
+
+
+def _is_control(other: Cell, cell: Cell) -> bool:
+    """Whether `other` is the head alone beside the same baseline, or the coin of `cell`."""
+    if other.rates_of == cell.label:
+        return True
+    alone = other.arm == "vex-head" and cell.baseline is not None
+    return alone and other.baseline == cell.baseline
+
+
+def _verdict(
+    cell: Cell, base: Cell, comparison: Comparison, family: str, tasks: int
+) -> dict[str, str]:
+    """`family`: what the test is corrected for, as `4 arms`."""
+    sentences = [
+        _finding(cell, base, comparison, family),
+        *_limits(cell, base, comparison, tasks),
+        *_circumstances(cell, base),
+    ]
+    text = " ".join(filter(None, sentences))
+    return {"task": cell.task, "label": cell.label, "against": base.label,
+            "kind": comparison.kind, "text": text}  # fmt: skip
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _finding(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str:
     """The verdict as a sentence, with what it rests on."""
     kind, (chance, low, high) = comparison.kind, comparison.improvement
     n, m = (len(c.values("final_return")) for c in (cell, base))
     if kind == "too few" or chance is None or low is None or high is None:
-        return _too_few(cell, base, comparison, arms)
+        return _too_few(cell, base, comparison, family)
     said = f"{kind} than" if kind != "no evidence" else "no evidence of a difference from"
-    correction = f" after Holm's correction for {arms} arms" if arms > 1 else ""
+    alone = family.startswith("1 ")
+    correction = "" if alone else f" after Holm's correction for {family}"
     shown = [_shown(x, 2, 0.5) for x in (chance, low, high)]
     p = "< 0.001" if comparison.p < 0.001 else f"= {_shown(comparison.p, 3, ALPHA)}"
     return (
@@ -236,14 +285,14 @@ def _finding(cell: Cell, base: Cell, comparison: Comparison, arms: int) -> str:
     )
 
 
-def _too_few(cell: Cell, base: Cell, comparison: Comparison, arms: int) -> str:
+def _too_few(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str:
     n, m = (len(c.values("final_return")) for c in (cell, base))
     text = (
         f"{cell.label}: too few seeds to say anything against {base.label} on {cell.task}: "
         f"{n} against {m} complete; at least {comparison.least} of each are needed"
     )
-    if arms > 1:
-        text += f" with {arms} arms compared"
+    if not family.startswith("1 "):
+        text += f" for {family}"
     if comparison.needed is not None:
         text += (
             f", and {_about(comparison.needed)} for a difference as large as the one seen, "
@@ -279,7 +328,7 @@ def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[
 
 def _circumstances(cell: Cell, base: Cell) -> list[str]:
     """What else the difference, or the lack of one, may come from."""
-    said = [_filtering(cell), _experience(cell, base)]
+    said = [_filtering(cell, "It") or _filtering(base, base.label), _experience(cell, base)]
     for number, text in (
         ("failed", "Failed seeds are left out ({}), which flatters an arm whose training broke."),
         ("unfinished", "Not finished yet: {}; a verdict read early is wrong more often."),
@@ -299,13 +348,13 @@ def _missing(cell: Cell) -> dict[str, int]:
     }
 
 
-def _filtering(cell: Cell) -> str:
+def _filtering(cell: Cell, name: str) -> str:
     keep_rate = cell.mean("keep_rate")
     filters = ARMS.get(cell.arm, {}).get("filter") != "none"
     if not filters or keep_rate is None or keep_rate < UNFILTERED:
         return ""
     dropped = "none" if keep_rate >= 1 else f"{100 * (1 - keep_rate):.2g}%"
-    return f"It dropped {dropped} of its steps, so no difference can be credited to filtering."
+    return f"{name} dropped {dropped} of its steps, so no difference can be credited to filtering."
 
 
 def _experience(cell: Cell, base: Cell) -> str:

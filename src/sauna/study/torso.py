@@ -216,8 +216,10 @@ def plots(measured: Mapping[str, Any]) -> list[Plot]:
         x, y = one.curve["env_steps"], one.curve["explained_variance"]
         lines.append(Line(label, x, y, [None] * len(x), [None] * len(x), []))
     said = escape(", ".join(f"{label} {_posture(one)}" for label, one in pair))
-    caption = (f"Of one pair of seeds: {said}. {chosen(measured)} Over the env steps that an "
-               f"update learned from, which a filter chooses. The axis is cut at -1.")  # fmt: skip
+    caption = (
+        f"Of one pair of seeds: {said}. {escape(chosen(measured))} Over the env steps that an "
+        f"update learned from, which a filter chooses. The axis is cut at -1."
+    )
     panel = Panel(f"{measured['cells'][0]['task']}, seed {pair[0][1].seed}", lines)
     return [
         Plot("pair", "Explained variance of one pair", caption, "env steps", "explained variance",
