@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sauna import JaxEnv, Transition
+from sauna import Filter, JaxEnv, Transition, VexTarget
 from sauna.core.population import member_keys
 
 LENGTH = 12
@@ -163,3 +163,10 @@ def faulty(fault: str) -> JaxEnv:
 
 def no_env(**kwargs: Any) -> int:
     return 3
+
+
+# Parts of a user's own with the mistakes that users make.
+misspelt = Filter(lambda n, room: (), lambda s, o, vex, k, hypers: (s, vex > hypers.treshold))
+too_long = Filter(lambda n, room: (), lambda s, o, vex, k, h: (s, jnp.append(vex, 0.0) > 0))
+forgetting = Filter(lambda n, room: jnp.zeros(n), lambda s, o, vex, k, h: (s.sum(), vex > 0))
+summed = VexTarget(lambda return_, value, weight, episode: jnp.sum(return_ - value))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import sauna
+from helpers import SMALL
 from sauna import placement, rundir
 from sauna.device_program import make_mesh
 from sauna.errors import BadInput
@@ -90,6 +91,22 @@ def test_devices_that_would_be_idle_are_refused(tmp_path: Path) -> None:
         sauna.train("jax_worlds:walk", seeds=3, envs=4, devices=5, device="cpu", quiet=True,
                     out=tmp_path / "run")  # fmt: skip
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_program_is_not_shared_over_processes(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"processes: 3 asked for, but .* one program"):
+        sauna.train("jax_worlds:walk", seeds=4, envs=4, devices=2, device="cpu", processes=3,
+                    quiet=True, out=tmp_path / "run")  # fmt: skip
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_on_the_device_is_never_resumed_inexactly(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    sauna.train("jax_worlds:walk", quiet=True, out=run, **SMALL)
+    (run / "summary.json").unlink()
+    with pytest.raises(BadInput, match="inexact: a run on the device"):
+        sauna.resume(run, inexact=True, quiet=True)
+    assert (run / "metrics.jsonl").exists()
 
 
 @pytest.mark.parametrize(

@@ -211,6 +211,19 @@ def test_non_finite_numbers_are_refused_with_their_place(make: Make) -> None:
 
 
 @backends
+def test_an_observation_of_another_shape_is_not_stretched(make: Make) -> None:
+    """One number would fill a row of three. The probe looks at the first episodes only."""
+    envs = make("worlds:Misshapen", {"first": 2})
+    envs.reset()
+    with pytest.raises(
+        EnvironmentFailure, match=r"episode 2, step 0.*shape \(1,\) instead of \(3,"
+    ):
+        for row in actions(60):
+            envs.step(row, np.ones(3, bool))
+    envs.close()
+
+
+@backends
 def test_an_exception_names_the_environment(make: Make) -> None:
     envs = make("worlds:Raising", {})
     envs.reset()

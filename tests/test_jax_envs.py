@@ -129,6 +129,16 @@ def test_the_host_face_is_an_ordinary_environment() -> None:
     assert not np.array_equal(unseeded, played[0][0])
 
 
+def test_a_reset_draws_nothing_that_the_actions_draw() -> None:
+    """Action noise of step t is drawn with `fold_in(key(seed), t)`; `split` folds in 0, 1, ..."""
+    world = make_env("jax_worlds:walk", {})
+    start = world.reset(seed=7)[0][0]
+    noise = [jax.random.normal(jax.random.fold_in(jax.random.key(7), t)) for t in range(4)]
+    assert start not in np.asarray(noise)
+    straight = jax.random.normal(jax.random.split(jax.random.key(7))[1])
+    assert straight in np.asarray(noise)  # what it would be without the face's own fold
+
+
 def test_a_missing_backend_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(BadInput, match=r"pip install 'sauna-rl\[playground\]'"):

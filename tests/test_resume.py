@@ -11,8 +11,10 @@ import pytest
 
 import sauna
 from helpers import SMALL, equal, make_job, resumed, train_here
-from sauna import checkpoint, rundir
+from sauna import checkpoint, presets, rundir
+from sauna import run as runs
 from sauna.errors import BadInput, SaunaError
+from sauna.metrics.display import make_display
 from worlds import Scripted
 
 WORLD = "worlds:Scripted"
@@ -92,6 +94,56 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys)
     assert (kept / "state.safetensors").read_bytes() == bytes(blob)
     assert (newest / "state.safetensors").read_bytes() == good
     assert (run / "metrics.jsonl").read_bytes() == expected
+
+
+def test_a_damaged_newer_checkpoint_takes_no_place_of_a_good_one(tmp_path) -> None:
+    arrays, manifest = {"x": np.ones(3, np.float32)}, {"config": {}}
+    checkpoint.save_checkpoint(tmp_path, 50, arrays, manifest, keep=1)
+    checkpoint.save_checkpoint(tmp_path, 100, arrays, manifest, keep=2)
+    (tmp_path / "00000100" / "state.safetensors").write_bytes(b"cut")
+    checkpoint.save_checkpoint(tmp_path, 70, arrays, manifest, keep=1)
+    found = checkpoint.load_newest(tmp_path, lambda text: None)
+    assert found is not None and found.path.name == "00000070"
+    assert not (tmp_path / "00000050").exists()
+
+
+def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch, capsys) -> None:
+    """A later version may have other presets; members' own values are the run's."""
+    run = finished(tmp_path)
+    expected = (run / "metrics.jsonl").read_bytes()
+    make_incomplete(run, 2)
+    changed = {**presets.PRESETS, "mujoco": {"learning_rate": 1e-3, "gae_lambda": 0.5}}
+    monkeypatch.setattr(presets, "PRESETS", changed)
+    held = runs.reopen(run, {}, make_display())
+    held.held.close()
+    assert {(m.config.learning_rate, m.config.gae_lambda) for m in held.members} == {(3e-4, 0.95)}
+    told = capsys.readouterr().out
+    assert "kept from the start: learning_rate 0.0003, gae_lambda 0.95" in told
+    monkeypatch.undo()
+    sauna.resume(run, quiet=True)
+    assert (run / "metrics.jsonl").read_bytes() == expected
+
+
+@pytest.mark.parametrize("change", [{"devices": 2}, {"device": "cpu"}, {"distributed": "h:1,2,0"}])
+def test_what_only_the_device_reads_is_refused_on_the_host(change: dict, tmp_path) -> None:
+    run = finished(tmp_path)
+    make_incomplete(run, 2)
+    with pytest.raises(BadInput, match="only read with backend device"):
+        sauna.resume(run, quiet=True, **change)
+
+
+def test_what_a_worker_finds_unusable_is_bad_input_and_leaves_nothing(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+
+    def refuse(*given) -> None:
+        raise BadInput("devices: 4 asked for, 1 are there")
+
+    monkeypatch.setattr("sauna.training.train_members", refuse)
+    with pytest.raises(BadInput, match="4 asked for"):
+        sauna.train(lambda: Scripted(), out=tmp_path / "a" / "run", quiet=True, **SMALL)
+    assert not (tmp_path / "a" / "run").exists()
 
 
 def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) -> None:

@@ -199,6 +199,21 @@ class NotANumber(Scripted):
         return seen
 
 
+class Misshapen(Scripted):
+    """Gives `size` numbers instead of the three it says, from episode `first` on."""
+
+    def __init__(self, size: int = 1, first: int = 0) -> None:
+        self.size, self.first, self.episode = size, first, -1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.episode += 1
+        return super().reset(seed=seed)
+
+    def observe(self) -> np.ndarray:
+        seen = super().observe()
+        return np.resize(seen, self.size) if self.episode >= self.first else seen
+
+
 class Poisoned(Scripted):
     """One number that is none, in one place of one episode.
 

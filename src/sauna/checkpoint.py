@@ -57,7 +57,9 @@ class Checkpoint(NamedTuple):
 def save_checkpoint(
     folder: Path, iteration: int, arrays: dict[str, np.ndarray], manifest: dict[str, Any], keep: int
 ) -> Path:
-    """Writes `folder/ITERATION` atomically, then removes all but the newest `keep`.
+    """Writes `folder/ITERATION` atomically, then removes all up to it but the newest `keep`.
+
+    One of a higher number is one that could not be used: it neither counts nor goes.
 
     Raises:
       NotFinite: an array is not finite; nothing was written.
@@ -92,7 +94,7 @@ def save_checkpoint(
     sync_folder(temporary)
     temporary.rename(final)
     sync_folder(folder)
-    for old in numbered(folder)[:-keep]:
+    for old in [path for path in numbered(folder) if path.name <= final.name][:-keep]:
         shutil.rmtree(old)
     return final
 

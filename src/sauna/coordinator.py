@@ -20,7 +20,7 @@ import numpy as np
 
 from sauna import checkpoint, rundir, watch
 from sauna.config import Config, local_parts, to_json
-from sauna.errors import Interrupted, SaunaError
+from sauna.errors import BadInput, Interrupted, SaunaError
 from sauna.metrics.curve import draw_curve
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
@@ -205,7 +205,8 @@ class Coordinator:
                 self._states[number][header["iteration"]] = message.arrays
                 self._flush()
             case "failure":
-                raise SaunaError(header["message"])
+                error = BadInput if header.get("bad_input") else SaunaError
+                raise error(header["message"])
             case "done":
                 self._ended[number] = self._reached[number]
                 self._grant()

@@ -261,10 +261,15 @@ def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, A
     A value edited in the stored config, or whose default has changed since, is given explicitly.
     The run directory is left out: a new run takes a new one.
     """
+    return {name: value for name, value in {**given, **drifted(stored, given)}.items()
+            if name != "out"}  # fmt: skip
+
+
+def drifted(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What of the `stored` config is not what `given` comes to today."""
     resolved = to_json(resolve(given))
-    edited = {
+    return {
         name: value
         for name, value in stored.items()
-        if name != "out" and (name not in resolved or resolved[name] != value)
+        if name not in resolved or resolved[name] != value
     }
-    return {**{name: value for name, value in given.items() if name != "out"}, **edited}

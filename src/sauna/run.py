@@ -23,7 +23,7 @@ from sauna.machines import Follower, check_shared, join, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.placement import look_at, placed
-from sauna.presets import ARMS, Member, members, parse_all, resolve, stored_config
+from sauna.presets import ARMS, Member, drifted, members, parse_all, resolve, stored_config
 from sauna.spaces import Spaces
 from sauna.untrusted import JSON_BYTES
 from sauna.worker import configure_jax
@@ -32,6 +32,8 @@ from sauna.worker import configure_jax
 # another number of devices computes it.
 RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
              "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
+# Fields of a stored config that the environment or the place of the run decided.
+SETTLED = ("out", "network", "normalize_observations")
 
 
 def plain(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,9 +191,7 @@ def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str
     Raises:
       BadInput: naming the field.
     """
-    for name in given:
-        if name in ON_DEVICE and config.backend != "device":
-            raise BadInput(f"{name}: only read with backend device")
+    _check_placement(config, given)
     names = ("hidden", "activation", "clip_observations")
     check_read([config], {name: given[name] for name in names if name in given})
     if "log_std_init" in given and spaces.action_kind != "continuous":
@@ -202,18 +202,41 @@ def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str
                            f"no running moments")  # fmt: skip
 
 
+def _check_placement(config: Config, given: Mapping[str, Any]) -> None:
+    """Refuses what the place of the environments leaves unread.
+
+    Raises:
+      BadInput: naming the field.
+    """
+    for name in given:
+        if name in ON_DEVICE and config.backend != "device":
+            raise BadInput(f"{name}: only read with backend device")
+    asked = parse_all(given).get("processes", 0)
+    if _together(config) and asked > 1:
+        raise BadInput(f"processes: {asked} asked for, but all members and devices are one program")
+
+
+def _together(config: Config) -> bool:
+    """Whether one program trains all members, on a GPU or on several devices."""
+    several = config.device == "gpu" or config.devices > 1 or bool(config.distributed)
+    return config.backend == "device" and several
+
+
 def _check_plugins(config: Config, spaces: Spaces) -> None:
-    """Builds the program here where the user brought parts of it: a mistake is bad input then.
+    """Builds and traces the program here where the user brought parts: a mistake is bad input then.
 
     Raises:
       BadInput: a part cannot be used.
     """
     if any(":" in name for name in (config.network, config.filter, config.vex_target)):
         configure_jax()
+        from sauna.collect.collected import capacity
         from sauna.core.population import make_program
+        from sauna.plugins import check_parts
 
         try:
-            make_program(config, spaces)
+            program = make_program(config, spaces)
+            check_parts(config, spaces, program.filter, capacity(config))
         except BadInput:
             raise
         except Exception as error:  # a user's part fails in its own way
@@ -237,12 +260,10 @@ def settle(config: Config, spaces: Spaces) -> Config:
         )
     number = len(config.arm) * len(config.seeds)
     processes = config.processes or os.cpu_count() or 1
-    together = config.device == "gpu" or config.devices > 1 or config.distributed
-    on_device = config.backend == "device"
-    if on_device and config.devices > 1:
+    if config.backend == "device" and config.devices > 1:
         check_shared("devices", number, config.envs, config.devices)
-    if on_device and together:
-        processes = 1  # one program for all members and all devices
+    if _together(config):
+        processes = 1
     return dataclasses.replace(
         config,
         network=network,
@@ -271,13 +292,20 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     _check_writes(config)
     if (config.backend == "device") != (stored["config"].get("backend") == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
+    _check_placement(config, changes)
     found = look_at(config)
     config = settle(config, found.spaces)
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
         raise BadInput(f"{config.env} has other spaces than when the run started: "
                        f"{found.spaces} instead of {stored['spaces']}")  # fmt: skip
+    # What the run began with, where a preset or a default has changed since.
+    began = drifted(stored["config"], stored.get("given", {}))
+    kept = {name: value for name, value in began.items() if name not in (*RESUMABLE, *SETTLED)}
+    if kept:
+        told = ", ".join(f"{name} {value}" for name, value in kept.items())
+        display.say(f"note: this version has other values; kept from the start: {told}")
     with _disk_errors(path):
-        return Run(path, dict(given), config, found, stored["drop_rates"])
+        return Run(path, {**given, **kept}, config, found, stored["drop_rates"])
 
 
 def _drop_rates(everyone: list[Member]) -> list[list[float]]:
@@ -314,12 +342,19 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
     """Trains a run to its end; returns when everything is written.
 
     Raises:
+      BadInput: a setting cannot be used after all, as a worker found; a new run is removed again.
       Interrupted: a signal came; the state is saved.
       SaunaError: something failed; the last good checkpoint is on disk.
     """
     try:
+        if inexact and run.config.backend == "device":
+            raise BadInput("inexact: a run on the device brings its environments back exactly")
         with _disk_errors(run.path):
             _train(run, display, resume, inexact)
+    except BadInput:
+        if not resume:  # what a worker found to be one before the first row: nothing is created
+            rundir.discard(run.path)
+        raise
     finally:
         run.held.close()
 

@@ -57,6 +57,16 @@ def create(path: Path) -> None:
             continue
 
 
+def discard(path: Path) -> None:
+    """Empties the directory of a run that has no row yet, and removes it where nothing is left."""
+    if any((path / name).exists() for name in LOGS):
+        return
+    (path / "config.json").unlink(missing_ok=True)
+    (path / ".lock").unlink(missing_ok=True)
+    if path.is_dir() and not any(path.iterdir()):
+        path.rmdir()
+
+
 def _counts(path: Path) -> bool:
     """Whether a file makes a folder a used one; what a kill cut short does not."""
     return path.name != ".lock" and not path.name.endswith(".writing")
@@ -106,7 +116,7 @@ def _holder(file: IO[str]) -> str:
 def write_json(path: Path, value: Any) -> None:
     """Atomically: a reader sees the old file or the new one."""
     temporary = path.with_name(f".{path.name}.writing")
-    write_durably(temporary, (json.dumps(value, indent=1) + "\n").encode())
+    write_durably(temporary, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
     temporary.replace(path)
     sync_folder(path.parent)
 

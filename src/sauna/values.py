@@ -71,4 +71,8 @@ def _json_object(value: Any) -> str:
     parsed = json.loads(value) if isinstance(value, str) else dict(value)
     if not isinstance(parsed, dict):
         raise ValueError
-    return json.dumps(parsed, sort_keys=True)
+    try:
+        return json.dumps(parsed, sort_keys=True, allow_nan=False)
+    except ValueError:  # which no reader of JSON would take back
+        raise BadInput("env_kwargs: JSON has no infinity and no NaN; 1e300 is a bound that nothing "
+                       "reaches") from None  # fmt: skip

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sauna.errors import SaunaError
+from sauna.errors import BadInput, SaunaError
 from sauna.wire import Shared, child_ends, receive, send
 
 BEAT = 2.0  # seconds between two signs of life
@@ -93,7 +93,8 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     except (EOFError, BrokenPipeError):
         return
     except SaunaError as error:
-        send(outbox, {"kind": "failure", "message": str(error)})
+        bad = isinstance(error, BadInput)
+        send(outbox, {"kind": "failure", "message": str(error), "bad_input": bad})
     except Exception:
         send(outbox, {"kind": "failure", "message": traceback.format_exc()})
 

@@ -165,7 +165,21 @@ class GymnasiumEnvs(HostEnvs):
             observation, _ = slot.env.reset(seed=episode_seed(*slot.seeds, slot.episode))
         except Exception as error:
             raise EnvironmentFailure(f"{slot.name}: reset raised {one_line(error)}") from error
-        self._observation[index] = self._read(observation)
+        self._put(self._observation, index, observation)
+
+    def _put(self, rows: np.ndarray, index: int, observation: Any) -> None:
+        """Copies an observation into its row; another shape must not be stretched to fit."""
+        try:
+            read = np.asarray(self._read(observation))
+            if read.shape != rows.shape[1:]:
+                raise ValueError(f"shape {read.shape} instead of {rows.shape[1:]}")
+        except Exception as error:
+            slot = self._slots[index]
+            raise EnvironmentFailure(
+                f"{slot.name}, episode {slot.episode}, step {self._steps_taken(index)}: "
+                f"observation cannot be read: {one_line(error)}"
+            ) from error
+        rows[index] = read
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
         self._terminated[:] = False
@@ -198,12 +212,12 @@ class GymnasiumEnvs(HostEnvs):
         if terminated or truncated:
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
-            self._final[index] = self._read(observation)
+            self._put(self._final, index, observation)
             self._final_sum = self._final.sum()
             self._check_finite(np.arange(len(self._slots)) == index)
             self._start_episode(index, slot)
             return True
-        self._observation[index] = self._read(observation)
+        self._put(self._observation, index, observation)
         self._life_lost[index] = lost = bool(info.get("life_lost", False))
         return lost
 

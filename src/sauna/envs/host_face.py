@@ -13,6 +13,10 @@ import numpy as np
 
 from sauna.envs.jax_env import JaxEnv
 
+# `split(key)[i]` is `fold_in(key, i)`: whoever plays an episode folds its env steps into the same
+# seed's key for the actions, and those must not be what the reset draws from.
+_RESET = 2**31
+
 
 class HostFace(gymnasium.Env):
     """One environment, its two functions compiled for this machine's CPU."""
@@ -30,7 +34,8 @@ class HostFace(gymnasium.Env):
         """Without a seed, the episode is drawn from the generator that the last seed began."""
         super().reset(seed=seed)
         drawn = seed if seed is not None else int(self.np_random.integers(2**31))
-        self._state, observation = self._reset(jax.random.key(drawn))
+        key = jax.random.fold_in(jax.random.key(drawn), _RESET)
+        self._state, observation = self._reset(key)
         return self._read(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

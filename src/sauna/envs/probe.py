@@ -100,12 +100,21 @@ def _arrays(tree: Any) -> Any:
 
 def _play(env: Any, seed: int) -> list[tuple[np.ndarray, float, bool]]:
     """`STEPS` steps of random actions: `(observation, reward, ended)` of each."""
-    read = observation_reader(env.observation_space)
+    reader = observation_reader(env.observation_space)
+    shape = describe(env.observation_space, env.action_space).observation_shape
+
+    def read(observation: Any) -> np.ndarray:
+        found = np.array(reader(observation))
+        if found.shape != shape:
+            raise ValueError(f"it says that observations are of shape {shape}, and gives "
+                             f"{found.shape}")  # fmt: skip
+        return found
+
     env.action_space.seed(seed)
-    seen = [(np.array(read(env.reset(seed=seed)[0])), 0.0, False)]
+    seen = [(read(env.reset(seed=seed)[0]), 0.0, False)]
     for _ in range(STEPS):
         observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        seen.append((np.array(read(observation)), float(reward), bool(terminated or truncated)))
+        seen.append((read(observation), float(reward), bool(terminated or truncated)))
         if seen[-1][2]:
             break
     return seen

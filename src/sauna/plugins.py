@@ -1,0 +1,62 @@
+"""A user's filter and Vex target, traced once: what they give is what training will scan over."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sauna.config import Config
+from sauna.core.types import Hypers
+from sauna.errors import BadInput
+from sauna.selection.filters import Filter
+from sauna.selection.vex import make_target
+from sauna.spaces import Spaces
+
+
+def check_parts(config: Config, spaces: Spaces, filter: Filter | None, capacity: int) -> None:
+    """Traces both, which compiles and computes nothing.
+
+    Args:
+      capacity: env steps that each env takes in a rollout at most.
+
+    Raises:
+      BadInput: what they give is of another shape or type than training needs.
+      Exception: whatever they raise themselves.
+    """
+    if filter is not None:
+        _check_filter(config, spaces, filter, capacity)
+    target = make_target(config)
+    shape = (config.rollout_steps * config.envs // config.minibatches,) if target.per_minibatch \
+        else (config.rollout_steps, config.envs)  # fmt: skip
+    x, episode = jax.ShapeDtypeStruct(shape, jnp.float32), jax.ShapeDtypeStruct(shape, jnp.int32)
+    told = jax.eval_shape(target.target, x, x, x, episode)
+    if getattr(told, "shape", None) != shape:
+        raise BadInput(f"vex_target: {config.vex_target} gives shape {_shape(told)} instead of "
+                       f"{shape}")  # fmt: skip
+
+
+def _check_filter(config: Config, spaces: Spaces, filter: Filter, capacity: int) -> None:
+    number: Any = jax.ShapeDtypeStruct((), jnp.float32)
+    kind = jnp.uint8 if spaces.observation_kind == "image" else jnp.float32
+    seen = jax.ShapeDtypeStruct((config.envs, *spaces.observation_shape), kind)
+    vex = jax.ShapeDtypeStruct((config.envs,), jnp.float32)
+    state = jax.eval_shape(lambda: filter.init(config.envs, capacity))
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    hypers = Hypers(*[number] * len(Hypers._fields))
+    after, mask = jax.eval_shape(filter.keep, state, seen, vex, key, hypers)
+    if getattr(mask, "shape", None) != (config.envs,) or mask.dtype != bool:
+        raise BadInput(f"filter: {config.filter} gives a mask of shape {_shape(mask)} and type "
+                       f"{getattr(mask, 'dtype', type(mask).__name__)} instead of {(config.envs,)} "
+                       f"and bool")  # fmt: skip
+    if jax.tree.map(_kind, after) != jax.tree.map(_kind, state):
+        raise BadInput(f"filter: {config.filter} gives a state of other arrays than it began with")
+
+
+def _shape(x: Any) -> Any:
+    return getattr(x, "shape", type(x).__name__)
+
+
+def _kind(leaf: Any) -> tuple[Any, Any]:
+    return leaf.shape, leaf.dtype
