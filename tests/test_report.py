@@ -154,7 +154,9 @@ def test_the_verdict_is_first_and_whole(report) -> None:
     _, page, summary = report
     places = [page.text.index(verdict["text"]) for verdict in summary["verdicts"]]
     assert places == sorted(places) and len(places) == 6
-    assert places[-1] < page.text.index("Final return, IQM")
+    filter = [page.text.index(verdict["text"]) for verdict in summary["filtering"]]
+    assert places[-1] < page.text.index("Is it the filter?") < filter[0] and len(filter) == 4
+    assert filter[-1] < page.text.index("Final return, IQM")
     chances = {(row["label"], row["task"]): row["improvement"] for row in summary["table"]}
     for label in ("vex-head", "sauna", "sauna 0.8"):
         of_tasks = [chances[label, task][:1] for task in ("HalfCheetah-v5", "Reacher-v5")]

@@ -106,14 +106,11 @@ def _plural(count: int, noun: str) -> str:
 
 
 def verdicts(summary: Mapping[str, Any]) -> str:
-    """Each verdict, its kind in words and shape; many as a table of arms by tasks, what they rest
-    on folded away."""
+    """Each arm against its baseline."""
     found = summary["verdicts"]
     if not found:
         return "<p>Nothing is compared: there is no arm beside the baseline.</p>"
-    if len(found) <= UNFOLDED:
-        return _sentences(found)
-    return f"{_counted(found)}{_grid(summary)}{_folds(found)}"
+    return _shown(found, "Verdicts by arm and task")
 
 
 def filtering(summary: Mapping[str, Any]) -> str:
@@ -121,8 +118,16 @@ def filtering(summary: Mapping[str, Any]) -> str:
     found = summary["filtering"]
     if not found:
         return ""
-    listed = _sentences(found) if len(found) <= UNFOLDED else _counted(found) + _folds(found)
-    return f"<h3>Is it the filter?</h3><p>{FILTERING}</p>{listed}"
+    return (f"<h3>Is it the filter?</h3><p>{FILTERING}</p>"
+            f"{_shown(found, 'Verdicts on the filter by arm and task')}")  # fmt: skip
+
+
+def _shown(found: Sequence[Mapping[str, Any]], name: str) -> str:
+    """Each verdict, its kind in words and shape; many as a table of arms by tasks, what they rest
+    on folded away."""
+    if len(found) <= UNFOLDED:
+        return _sentences(found)
+    return f"{_counted(found)}{_grid(found, name)}{_folds(found)}"
 
 
 def _counted(found: Sequence[Mapping[str, Any]]) -> str:
@@ -159,27 +164,24 @@ def _class(verdict: Mapping[str, Any]) -> str:
     return str(verdict["kind"]).replace(" ", "-")
 
 
-def _grid(summary: Mapping[str, Any]) -> str:
-    """Arms by tasks: the kind of each verdict and the chance to be better."""
-    found = {(v["label"], v["task"]): v for v in summary["verdicts"]}
-    table = {(row["label"], row["task"]): row for row in summary["table"]}
-    tasks = list(dict.fromkeys(task for _, task in found))
+def _grid(verdicts: Sequence[Mapping[str, Any]], name: str) -> str:
+    """Pairs of arms by tasks: the kind of each verdict and the chance to be better."""
+    found = {(v["label"], v["against"], v["task"]): v for v in verdicts}
+    tasks = list(dict.fromkeys(v["task"] for v in verdicts))
     rows = []
-    for label in dict.fromkeys(label for label, _ in found):
-        baseline = next(row["baseline"] for (name, _), row in table.items() if name == label)
+    for label, against in dict.fromkeys((v["label"], v["against"]) for v in verdicts):
         cells = [
-            f'<span class="{_class(verdict)}"><span role="img" aria-label="{verdict["kind"]}">'
-            f"{MARKS[verdict['kind']]}</span> "
-            f"{tables.number(table[label, task]['improvement'][0], 2)}</span>"
-            if (verdict := found.get((label, task)))
+            f'<span class="{_class(v)}"><span role="img" aria-label="{v["kind"]}">'
+            f"{MARKS[v['kind']]}</span> {tables.number(v['chance'], 2)}</span>"
+            if (v := found.get((label, against, task)))
             else ""
             for task in tasks
         ]
-        rows.append((f'{escape(label)} <span class="interval">than {escape(baseline)}</span>',
+        rows.append((f'{escape(label)} <span class="interval">than {escape(against)}</span>',
                      cells))  # fmt: skip
     marks = ", ".join(f"{mark} {kind}" for kind, mark in MARKS.items())
     return (
-        tables.table(("Better", *map(escape, tasks)), rows, name="Verdicts by arm and task")
+        tables.table(("Better", *map(escape, tasks)), rows, name=name)
         + f'<p class="notes">{marks}. The number is the chance that a seed of the arm ends above '
         "one of the arm it is compared with; 0.5 is no difference.</p>"
     )

@@ -209,7 +209,7 @@ def _listed(values: np.ndarray) -> list[float | None]:
 
 def _verdicts(
     cells: Sequence[Cell], found: Mapping[str, Comparison], tasks: int
-) -> list[dict[str, str]]:
+) -> list[dict[str, Any]]:
     of_label = {cell.label: cell for cell in cells}
     verdicts = []
     for label, comparison in found.items():
@@ -221,7 +221,7 @@ def _verdicts(
     return verdicts
 
 
-def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, str]]:
+def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
     """Each arm that filters against those that differ from it in the choice of steps alone.
 
     These are the arm that trains the head and drops nothing, and the coin that drops as much. A
@@ -252,7 +252,7 @@ def _is_control(other: Cell, cell: Cell) -> bool:
 
 def _verdict(
     cell: Cell, base: Cell, comparison: Comparison, family: str, tasks: int
-) -> dict[str, str]:
+) -> dict[str, Any]:
     """`family`: what the test is corrected for, as `4 arms`."""
     sentences = [
         _finding(cell, base, comparison, family),
@@ -261,7 +261,8 @@ def _verdict(
     ]
     text = " ".join(filter(None, sentences))
     return {"task": cell.task, "label": cell.label, "against": base.label,
-            "kind": comparison.kind, "text": text}  # fmt: skip
+            "kind": comparison.kind, "chance": comparison.improvement.value,
+            "text": text}  # fmt: skip
 
 
 def _plural(count: int, noun: str) -> str:
