@@ -70,15 +70,16 @@ def claims_rows(results: Mapping[str, Any]) -> list[list[str]]:
                     baseline,
                     *_judged(pairs, keep_rates, label != "vex-head"),
                 ]
-                row[-1] += _circumstances(cells)
+                row[-1] += _circumstances(cells, claim.score)
                 if len(pairs) < studied:
                     row[-1] += f" ({len(pairs)} of {studied} tasks so far)"
                 rows.append(row)
     return rows
 
 
-def _circumstances(cells: list[tuple[dict[str, Any], dict[str, Any]]]) -> str:
-    """What else a difference may come from: seeds that are left out, and more env steps."""
+def _circumstances(cells: list[tuple[dict[str, Any], dict[str, Any]]], score: str) -> str:
+    """What else a difference may come from: seeds that are left out, and more env steps (of which
+    an area counts the budget's alone)."""
     said = ""
     failed = sum(
         m["status"] == "failed" for pair in cells for cell in pair for m in cell["members"]
@@ -87,7 +88,7 @@ def _circumstances(cells: list[tuple[dict[str, Any], dict[str, Any]]]) -> str:
         said += f"; {failed} failed seeds are left out"
     ratios = [_scores(own, "env_steps").mean() / _scores(base, "env_steps").mean()
               for own, base in cells]  # fmt: skip
-    if max(ratios) > 1 + MORE_STEPS:
+    if score == "final_return" and max(ratios) > 1 + MORE_STEPS:
         said += f"; it took up to {max(ratios):.2f} times the env steps"
     return said
 

@@ -325,7 +325,7 @@ def why() -> str:
         drawn = draw_plots(extra.plots, extra.looks, ROOT / "docs" / "why")
         parts.append(f"`{measured['command']}`")
         parts.append(_listed(study.verdicts(measured)))
-        if study is torso and STILLS.exists():
+        if study is torso and STILLS.exists() and torso.shown_pair(measured):
             parts.append(f"![Stills of one pair](why/figures/{STILLS.name})")
             parts.append(f"{torso.chosen(measured)} Of each its clearest episode in that posture.")
         parts += [f"![{p.title}](why/figures/{p.name}.png)\n\n{p.caption}" for p in extra.plots]

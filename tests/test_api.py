@@ -167,6 +167,13 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     assert "The filter is my_filters:lower_half" in told and "inside the band" not in told
 
 
+@pytest.mark.parametrize("name", ["smoothed", "by_numpy"])
+def test_filters_of_ones_own_may_be_plain(name: str, tmp_path) -> None:
+    run = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run", arm="sauna",
+                      filter=f"jax_worlds:{name}", **SMALL)  # fmt: skip
+    assert all(0 < row["keep_rate"] <= 1 for row in run.metrics)
+
+
 def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
     text = (ROOT / "docs" / "plugins.md").read_text()
     (tmp_path / "my_targets.py").write_text(text.split("```python\n")[2].split("```")[0])

@@ -166,6 +166,13 @@ def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> 
     assert rows == [row for row in rundir.rows(first) if row["seed"] == 4]
 
 
+def test_processes_that_the_machine_decided_are_not_repeated() -> None:
+    given = {"env": WORLD, "seeds": 2}
+    stored = {**to_json(resolve(given)), "processes": 2}
+    assert given_by(stored, given) == given
+    assert given_by(stored, {**given, "processes": 2})["processes"] == 2
+
+
 def test_a_value_edited_in_config_json_counts(tmp_path) -> None:
     given = {"env": WORLD, "arm": "sauna", "seeds": "2"}
     stored = to_json(resolve(given))

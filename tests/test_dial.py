@@ -83,6 +83,17 @@ def test_an_arm_is_told_apart_from_its_coin_pair_by_pair() -> None:
     assert "; 9 members." in verdicts(study(*RISING))[0]
     part = [*RISING[:2], {**RISING[2], "seeds": 4}]
     assert "; 9 members of 10 so far." in verdicts(study(*part))[0]
+    untrained = cell("1.5", [], threshold=1.5) | {"seeds": 3}
+    assert "; 9 members of 12 so far." in verdicts(study(*RISING, untrained))[0]
+    assert text_table(study(*RISING, untrained))[-1][2] == "0 of 3"
+
+
+def test_an_arms_numbers_are_of_the_same_members() -> None:
+    """One that is trained and not measured yet counts in none of them."""
+    part = cell("x", [0.1, 0.2, 9.0], threshold=0.2)
+    part["members"][2]["points"] = []
+    (mark,) = marks(study(part), "A-v0")
+    assert {len(values) for values in mark.members.values()} == {2}
 
 
 def test_the_p_value_is_that_of_all_deals() -> None:

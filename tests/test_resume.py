@@ -14,6 +14,7 @@ from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna import checkpoint, presets, rundir
 from sauna import run as runs
 from sauna.errors import BadInput, SaunaError
+from sauna.measure.streams import load_standing
 from sauna.metrics.display import make_display
 from worlds import Scripted
 
@@ -119,6 +120,8 @@ def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch, capsys
     assert {(m.config.learning_rate, m.config.gae_lambda) for m in held.members} == {(3e-4, 0.95)}
     told = capsys.readouterr().out
     assert "kept from the start: learning_rate 0.0003, gae_lambda 0.95" in told
+    standing = load_standing(run, held.members[0].name, 2)
+    assert float(standing.hypers.gae_lambda) == np.float32(0.95)
     monkeypatch.undo()
     sauna.resume(run, quiet=True)
     assert (run / "metrics.jsonl").read_bytes() == expected
@@ -144,6 +147,11 @@ def test_what_a_worker_finds_unusable_is_bad_input_and_leaves_nothing(
     with pytest.raises(BadInput, match="4 asked for"):
         sauna.train(lambda: Scripted(), out=tmp_path / "a" / "run", quiet=True, **SMALL)
     assert not (tmp_path / "a" / "run").exists()
+    ours = tmp_path / "ours"
+    ours.mkdir()
+    with pytest.raises(BadInput, match="4 asked for"):
+        sauna.train(lambda: Scripted(), out=ours, quiet=True, **SMALL)
+    assert list(ours.iterdir()) == []  # what the user made stays
 
 
 def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) -> None:

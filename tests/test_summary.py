@@ -193,6 +193,15 @@ def test_the_filter_is_held_against_the_head_alone_and_its_coin() -> None:
     assert found["verdicts"][-1]["kind"] == "better"
     assert {v["kind"] for v in found["filtering"]} == {"no evidence"}
     assert summarize(results(*arms[:2]))["filtering"] == []
+    paper = cell("sauna-paper", HIGH, keep_rate=0.7)  # its head learns another target
+    assert summarize(results(*arms[:2], paper))["filtering"] == []
+    own = [
+        {**arms[1], "config": {"gamma": 0.9, "threshold": 0.3}},
+        {**cell("sauna", HIGH, keep_rate=0.7), "config": {"gamma": 0.9, "threshold": 0.8}},
+    ]
+    assert len(summarize(results(arms[0], *own))["filtering"]) == 1
+    own[1]["config"]["gamma"] = 0.99
+    assert summarize(results(arms[0], *own))["filtering"] == []
     ruled = {**cell("sauna", HIGH, keep_rate=0.7), "baseline": "ppo, other rules"}
     assert summarize(results(*arms[:2], ruled))["filtering"] == []  # another head, of other rules
 
@@ -201,6 +210,9 @@ def test_a_baseline_that_filtered_nothing_is_told() -> None:
     stored = {**results(cell("sauna", LOW, keep_rate=1.0), cell("ppo", HIGH)), "baseline": "sauna"}
     text = summarize(stored)["verdicts"][0]["text"]
     assert "sauna dropped none of its steps, so no difference can be credited" in text
+    filtered = cell("more", HIGH, arm="sauna", keep_rate=0.6)
+    stored = {**results(cell("none", LOW, arm="sauna"), filtered), "baseline": "none"}
+    assert "credited" not in summarize(stored)["verdicts"][0]["text"]  # it is the filter, or may be
 
 
 def test_words_and_intervals_agree_on_random_studies() -> None:

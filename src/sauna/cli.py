@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    from sauna.run import RESUMABLE
+    from sauna.presets import RESUMABLE
 
     _add_fields(resume, list(RESUMABLE))
 

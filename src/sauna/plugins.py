@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -42,21 +43,29 @@ def _check_filter(config: Config, spaces: Spaces, filter: Filter, capacity: int)
     kind = jnp.uint8 if spaces.observation_kind == "image" else jnp.float32
     seen = jax.ShapeDtypeStruct((config.envs, *spaces.observation_shape), kind)
     vex = jax.ShapeDtypeStruct((config.envs,), jnp.float32)
-    state = jax.eval_shape(lambda: filter.init(config.envs, capacity))
+    init = partial(filter.init, config.envs, capacity)  # traced on the device alone
+    state = jax.eval_shape(init) if config.backend == "device" else init()
     key = jax.eval_shape(lambda: jax.random.key(0))
     hypers = Hypers(*[number] * len(Hypers._fields))
-    after, mask = jax.eval_shape(filter.keep, state, seen, vex, key, hypers)
+    before = jax.eval_shape(lambda x: x, state)
+    after, mask = jax.eval_shape(filter.keep, before, seen, vex, key, hypers)
     if getattr(mask, "shape", None) != (config.envs,) or mask.dtype != bool:
         raise BadInput(f"filter: {config.filter} gives a mask of shape {_shape(mask)} and type "
                        f"{getattr(mask, 'dtype', type(mask).__name__)} instead of {(config.envs,)} "
                        f"and bool")  # fmt: skip
-    if jax.tree.map(_kind, after) != jax.tree.map(_kind, state):
+    (old, structure), (new, other) = _flat(before), _flat(after)
+    if structure != other or not all(map(_may_become, old, new)):
         raise BadInput(f"filter: {config.filter} gives a state of other arrays than it began with")
+
+
+def _flat(tree: Any) -> tuple[list[Any], Any]:
+    return jax.tree.flatten(tree)
 
 
 def _shape(x: Any) -> Any:
     return getattr(x, "shape", type(x).__name__)
 
 
-def _kind(leaf: Any) -> tuple[Any, Any]:
-    return leaf.shape, leaf.dtype
+def _may_become(before: Any, after: Any) -> bool:
+    """Whether a loop may carry both; a Python number takes the type that it is used with."""
+    return before.shape == after.shape and (before.dtype == after.dtype or before.weak_type)

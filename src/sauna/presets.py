@@ -131,6 +131,14 @@ SHARED_RULES = ("vex_target", "filter", "threshold_schedule", "keep_rate_target"
                  "budget")  # fmt: skip
 
 
+# Fields that `resume` may change: they do not touch what is computed, or only its rounding where
+# another number of devices computes it.
+RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
+             "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
+# Fields of a stored config that the environment or the place of the run decided.
+SETTLED = ("out", "network", "normalize_observations")
+
+
 class Member(NamedTuple):
     """One seed of one arm: what a population is made of."""
 
@@ -259,13 +267,24 @@ def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, A
     """What a user has to give to get the `stored` config again, knowing what was `given` then.
 
     A value edited in the stored config, or whose default has changed since, is given explicitly.
-    The run directory is left out: a new run takes a new one.
+    The run directory is left out, as a new run takes a new one, and the number of processes that
+    the machine decided.
     """
-    return {name: value for name, value in {**given, **drifted(stored, given)}.items()
-            if name != "out"}  # fmt: skip
+    drift = {name: value for name, value in _drifted(stored, given).items() if name != "processes"}
+    return {name: value for name, value in {**given, **drift}.items() if name != "out"}
 
 
-def drifted(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def as_began(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was `given`, and what a preset or a default gave then and does not give today.
+
+    Members take their own values from it; `stored` is the config that the run began with.
+    """
+    drift = _drifted({**to_json(Config()), **stored}, given)
+    kept = {name: value for name, value in drift.items() if name not in (*RESUMABLE, *SETTLED)}
+    return {**given, **kept}
+
+
+def _drifted(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """What of the `stored` config is not what `given` comes to today."""
     resolved = to_json(resolve(given))
     return {

@@ -23,17 +23,19 @@ from sauna.machines import Follower, check_shared, join, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.placement import look_at, placed
-from sauna.presets import ARMS, Member, drifted, members, parse_all, resolve, stored_config
+from sauna.presets import (
+    ARMS,
+    RESUMABLE,
+    Member,
+    as_began,
+    members,
+    parse_all,
+    resolve,
+    stored_config,
+)
 from sauna.spaces import Spaces
 from sauna.untrusted import JSON_BYTES
 from sauna.worker import configure_jax
-
-# Fields that `resume` may change: they do not touch what is computed, or only its rounding where
-# another number of devices computes it.
-RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
-             "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
-# Fields of a stored config that the environment or the place of the run decided.
-SETTLED = ("out", "network", "normalize_observations")
 
 
 def plain(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -56,8 +58,10 @@ class Run:
         config: Config,
         found: Probe,
         drop_rates: list[list[float]],
+        made: bool = False,
     ) -> None:
         self.path, self.given, self.config = path, given, config
+        self.made = made  # the directory, by us
         self.spaces, self.differs = found
         self.members: list[Member] = members(config, given)
         self.drop_rates = drop_rates
@@ -98,9 +102,10 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
         "git": rundir.git_revision(),
         "machine": rundir.machine(),
     }
+    made = not path.exists()
     with _disk_errors(path):
         rundir.create(path)
-        run = Run(path, given, config, found, drop_rates)
+        run = Run(path, given, config, found, drop_rates, made)
         try:
             rundir.create(path)  # again, now that it is ours: another may have been faster
             rundir.write_json(path / "config.json", stored)
@@ -298,14 +303,13 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
         raise BadInput(f"{config.env} has other spaces than when the run started: "
                        f"{found.spaces} instead of {stored['spaces']}")  # fmt: skip
-    # What the run began with, where a preset or a default has changed since.
-    began = drifted(stored["config"], stored.get("given", {}))
-    kept = {name: value for name, value in began.items() if name not in (*RESUMABLE, *SETTLED)}
+    before = stored.get("given", {})
+    began = as_began(stored["config"], before)
+    kept = [f"{name} {value}" for name, value in began.items() if before.get(name) != value]
     if kept:
-        told = ", ".join(f"{name} {value}" for name, value in kept.items())
-        display.say(f"note: this version has other values; kept from the start: {told}")
+        display.say(f"note: this version has other values; kept from the start: {', '.join(kept)}")
     with _disk_errors(path):
-        return Run(path, {**given, **kept}, config, found, stored["drop_rates"])
+        return Run(path, {**began, **changes}, config, found, stored["drop_rates"])
 
 
 def _drop_rates(everyone: list[Member]) -> list[list[float]]:
@@ -353,7 +357,7 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
             _train(run, display, resume, inexact)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
-            rundir.discard(run.path)
+            rundir.discard(run.path, run.made)
         raise
     finally:
         run.held.close()

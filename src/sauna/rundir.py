@@ -10,6 +10,7 @@ figures/, videos/, tensorboard/
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import fcntl
 import importlib.metadata
@@ -57,14 +58,15 @@ def create(path: Path) -> None:
             continue
 
 
-def discard(path: Path) -> None:
-    """Empties the directory of a run that has no row yet, and removes it where nothing is left."""
+def discard(path: Path, made: bool) -> None:
+    """Empties the directory of a run that has no row yet, and removes it where the run made it."""
     if any((path / name).exists() for name in LOGS):
         return
-    (path / "config.json").unlink(missing_ok=True)
-    (path / ".lock").unlink(missing_ok=True)
-    if path.is_dir() and not any(path.iterdir()):
-        path.rmdir()
+    with contextlib.suppress(OSError):  # what went wrong is told already, and matters more
+        (path / "config.json").unlink(missing_ok=True)
+        (path / ".lock").unlink(missing_ok=True)
+        if made:
+            path.rmdir()
 
 
 def _counts(path: Path) -> bool:

@@ -21,7 +21,7 @@ from sauna import checkpoint, rundir
 from sauna.artifact import load_artifact
 from sauna.config import FIELDS, TYPES
 from sauna.errors import BadInput, SaunaError
-from sauna.run import RESUMABLE
+from sauna.presets import RESUMABLE
 
 # A value of the same type that is another one, where adding 1 would not be.
 OTHERS = {"env_kwargs": {"speed": 2}, "arm": ["sauna"], "seeds": [7],

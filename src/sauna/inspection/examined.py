@@ -21,7 +21,7 @@ from sauna.envs.gymnasium import make_env
 from sauna.inspection.decided import Decisions, advantages, decide, environments
 from sauna.inspection.played import Played, clock, open_world, play_episodes, play_steps
 from sauna.member_state import Counters, under
-from sauna.presets import Member, members
+from sauna.presets import Member, as_began, members
 from sauna.trained import TrainedPolicy
 from sauna.training import hypers_now
 
@@ -62,7 +62,7 @@ def examine(
 ) -> Inspection:
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
-    everyone = members(artifact.config, manifest["given"])
+    everyone = members(artifact.config, as_began(manifest["config"], manifest["given"]))
     member = next(one for one in everyone if one.name == name)
     config, iteration = member.config, int(manifest["iteration"])
     kwargs = json.loads(config.env_kwargs)

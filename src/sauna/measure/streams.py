@@ -27,7 +27,7 @@ from sauna.core.population import Program, make_program, member_keys
 from sauna.core.types import Array, Hypers, Rollout
 from sauna.envs.backend import in_process_envs
 from sauna.member_state import Counters, fitting, flat_params, moments_of, under
-from sauna.presets import Member, members, stored_config
+from sauna.presets import Member, as_began, members, stored_config
 from sauna.spaces import Spaces, read_spaces
 from sauna.training import hypers_now
 
@@ -83,7 +83,8 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     config = stored_config(loaded.manifest["config"])
     spaces = read_spaces(loaded.manifest["spaces"])
-    everyone = members(config, loaded.manifest["given"])
+    given = as_began(loaded.manifest["config"], loaded.manifest["given"])
+    everyone = members(config, given)
     place = next(p for p, member in enumerate(everyone) if member.name == name)
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)

@@ -73,14 +73,17 @@ def looks() -> dict[str, style.Look]:
 
 
 def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
-    """Every arm of a task whose threshold is known, in the order of the study."""
+    """Every arm of a task whose threshold is known, in the order of the study.
+
+    Of members that are measured: all of an arm's numbers are of the same ones.
+    """
     cells = [cell for cell in measured["cells"] if cell["task"] == task]
     thresholds = {cell["label"]: _threshold(cell) for cell in cells}
     found = []
     for cell in cells:
         numbers = {
             key: [(m["seed"], float(value)) for m in cell["members"]
-                  if (value := _number(m, key)) is not None]
+                  if m["points"] and (value := _number(m, key)) is not None]
             for key, *_ in QUANTITIES
         }  # fmt: skip
         kind = _kind(cell)

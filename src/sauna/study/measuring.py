@@ -46,8 +46,26 @@ class Item(NamedTuple):
         return all(file.exists() for file in self.files)
 
 
-def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator[Item]:
-    """Every complete member that can be measured."""
+def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> list[Item]:
+    """Every complete member that can be measured.
+
+    What is measured in a scale belongs to the scale's checkpoint as well.
+    """
+    items = list(_items(spec, units, folder, place))
+    if spec.measure != "dial":
+        return items
+    scales = {task: scale_of(spec, items, task) for task in spec.tasks}
+    marks = {task: _mark(Path(scale["run"]), scale["iteration"]) if scale else "unscaled"
+             for task, scale in scales.items()}  # fmt: skip
+    return [
+        item._replace(
+            files=[file.with_name(f"{file.stem}_{marks[item.task]}.json") for file in item.files]
+        )
+        for item in items
+    ]
+
+
+def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator[Item]:
     assert spec.measure is not None
     for arm in spec.arms:
         for unit in (unit for unit in units if unit.label == arm.label):
@@ -118,7 +136,7 @@ def measure(
 
     A member whose measurement fails is told and left out; the study, run again, tries it again.
     """
-    items = list(items_of(spec, units, folder, place))
+    items = items_of(spec, units, folder, place)
     scales = {}
     if spec.measure == "dial":
         scales = {task: scale_of(spec, items, task) for task in spec.tasks}
@@ -187,8 +205,8 @@ def gather_measured(
 ) -> dict[str, Any]:
     """What has been measured so far, beside the numbers of `results` that it is set against.
 
-    Every cell of `results` with a complete member that can be measured is there, and of each such
-    member its `points`: none of a member
+    Every cell of `results` that can be measured is there, and of each complete member its
+    `points`: none of a member
     whose later checkpoints are still to be measured, since early ones alone would pass for all.
     """
     points: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
@@ -214,7 +232,8 @@ def gather_measured(
             for member in cell["members"]
             if (*key, member["seed"]) in points
         ]
-        if members:
+        nothing = spec.measure == "noise" and drops_nothing(check(arms[key[1]], key[0]))
+        if not nothing:
             settings = {name: config[name] for name in SETTINGS}
             cells.append(
                 {"task": key[0], "label": key[1], "arm": cell["arm"], "steps": config["steps"],

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.config import Config
 from sauna.errors import BadInput
 from sauna.presets import ARMS
 from sauna.study.statistics import (
@@ -29,6 +31,10 @@ from sauna.study.statistics import (
 )
 
 FORMAT = 1
+# Settings that two arms may differ in and yet differ in the choice of steps alone.
+FILTERS_OWN = ("arm", "seeds", "out", "processes", "filter", "threshold", "threshold_schedule",
+               "keep_rate_target", "history", "decision", "dropped", "max_env_steps_factor",
+               "drop_rate", "drop_rate_from")  # fmt: skip
 GRID = 60  # points of a curve at most
 UNFILTERED = 0.99  # mean keep rate from which a difference is not credited to filtering
 MORE_STEPS = 0.01  # relative difference in env steps from which it is mentioned
@@ -58,6 +64,7 @@ class Cell(NamedTuple):
     running: int
     waiting: int
     rates_of: str | None = None  # of a coin, the label whose drop rates it repeats
+    config: Mapping[str, Any] = MappingProxyType({})  # empty where only numbers were stored
 
     def values(self, name: str) -> np.ndarray:
         """The finite values of a member's entry `name`, over complete members."""
@@ -107,7 +114,7 @@ def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
     complete = [member for member in members if member["status"] == "complete"]
     return Cell(
         stored["task"], stored["label"], stored["arm"], own, complete, failed, running, waiting,
-        stored.get("rates_of"),
+        stored.get("rates_of"), stored.get("config") or {},
     )  # fmt: skip
 
 
@@ -243,11 +250,19 @@ def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
 
 
 def _is_control(other: Cell, cell: Cell) -> bool:
-    """Whether `other` is the head alone beside the same baseline, or the coin of `cell`."""
+    """Whether `other` is the coin of `cell`, or trains the same head by the same rules alone.
+
+    Without stored settings an arm's name says what its rules are.
+    """
     if other.rates_of == cell.label:
         return True
-    alone = other.arm == "vex-head" and cell.baseline is not None
-    return alone and other.baseline == cell.baseline
+    if other.arm != "vex-head" or cell.baseline is None or other.baseline != cell.baseline:
+        return False
+    if cell.config and other.config:
+        names = (set(cell.config) | set(other.config)) - set(FILTERS_OWN)
+        return all(cell.config.get(name) == other.config.get(name) for name in names)
+    return all(getattr(Config(), name) == value for name, value in ARMS[cell.arm].items()
+               if name not in FILTERS_OWN)  # fmt: skip
 
 
 def _verdict(
@@ -329,7 +344,8 @@ def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[
 
 def _circumstances(cell: Cell, base: Cell) -> list[str]:
     """What else the difference, or the lack of one, may come from."""
-    said = [_filtering(cell, "It") or _filtering(base, base.label), _experience(cell, base)]
+    filtering = _filtering(cell, "It") if _filters(cell) else _filtering(base, base.label)
+    said = [filtering, _experience(cell, base)]
     for number, text in (
         ("failed", "Failed seeds are left out ({}), which flatters an arm whose training broke."),
         ("unfinished", "Not finished yet: {}; a verdict read early is wrong more often."),
@@ -349,10 +365,13 @@ def _missing(cell: Cell) -> dict[str, int]:
     }
 
 
+def _filters(cell: Cell) -> bool:
+    return ARMS.get(cell.arm, {}).get("filter") != "none"
+
+
 def _filtering(cell: Cell, name: str) -> str:
     keep_rate = cell.mean("keep_rate")
-    filters = ARMS.get(cell.arm, {}).get("filter") != "none"
-    if not filters or keep_rate is None or keep_rate < UNFILTERED:
+    if not _filters(cell) or keep_rate is None or keep_rate < UNFILTERED:
         return ""
     dropped = "none" if keep_rate >= 1 else f"{100 * (1 - keep_rate):.2g}%"
     return f"{name} dropped {dropped} of its steps, so no difference can be credited to filtering."
