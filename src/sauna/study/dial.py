@@ -226,6 +226,9 @@ def _verdict(task: str, found: Sequence[Mark]) -> str:
     else:
         dial = "no evidence that the threshold is a dial of exploration: entropy and coverage do " \
                "not both follow it one way"  # fmt: skip
+    coins = any(mark.drops_like for mark in found)
+    if explores in ({1}, {-1}) and coins:
+        dial += " (what fewer updates alone do, the coins say)"
     number, wanted = known["coverage"][2], sum(m.seeds for m in found if m.kind == "constant")
     so_far = "" if number == wanted else f" of {wanted} so far"
     return f"{task}: {dial}. With a rising threshold {'; '.join(said)}; {number} members{so_far}."
