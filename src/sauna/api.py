@@ -91,7 +91,8 @@ def compare(
       **settings: of every run (`seeds=6`, `steps=1_000_000`).
 
     Returns:
-      the summary: its `table`, its `verdicts`; `report.html` beside it is the same to look at.
+      the summary: its `table`, its `verdicts`, those on the filter alone (`filtering`);
+      `report.html` beside it is the same to look at.
 
     Raises:
       BadInput: something is not usable; nothing was created.

@@ -206,8 +206,8 @@ def gather_measured(
     """What has been measured so far, beside the numbers of `results` that it is set against.
 
     Every cell of `results` that can be measured is there, and of each complete member its
-    `points`: none of a member
-    whose later checkpoints are still to be measured, since early ones alone would pass for all.
+    `points`: none of a member whose later checkpoints are still to be measured, since early ones
+    alone would pass for all.
     """
     points: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for item in items_of(spec, units, folder, place):
