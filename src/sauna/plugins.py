@@ -8,26 +8,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sauna.collect.collected import capacity
 from sauna.config import Config
+from sauna.core.population import make_program
 from sauna.core.types import Hypers
-from sauna.errors import BadInput
+from sauna.errors import BadInput, one_line
 from sauna.selection.filters import Filter
 from sauna.selection.vex import make_target
 from sauna.spaces import Spaces
 
 
-def check_parts(config: Config, spaces: Spaces, filter: Filter | None, capacity: int) -> None:
-    """Traces both, which compiles and computes nothing.
-
-    Args:
-      capacity: env steps that each env takes in a rollout at most.
+def check_plugins(config: Config, spaces: Spaces) -> None:
+    """Builds the program and traces filter and target, which compiles and computes nothing.
 
     Raises:
-      BadInput: what they give is of another shape or type than training needs.
-      Exception: whatever they raise themselves.
+      BadInput: a part cannot be used, or gives another shape or type than training needs.
     """
-    if filter is not None:
-        _check_filter(config, spaces, filter, capacity)
+    try:
+        program = make_program(config, spaces)
+        if program.filter is not None:
+            _check_filter(config, spaces, program.filter)
+        _check_target(config)
+    except BadInput:
+        raise
+    except Exception as error:  # a user's part fails in its own way
+        raise BadInput(f"a part of your own cannot be used: {one_line(error)}") from error
+
+
+def _check_target(config: Config) -> None:
     target = make_target(config)
     shape = (config.rollout_steps * config.envs // config.minibatches,) if target.per_minibatch \
         else (config.rollout_steps, config.envs)  # fmt: skip
@@ -38,12 +46,12 @@ def check_parts(config: Config, spaces: Spaces, filter: Filter | None, capacity:
                        f"{shape}")  # fmt: skip
 
 
-def _check_filter(config: Config, spaces: Spaces, filter: Filter, capacity: int) -> None:
+def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
     number: Any = jax.ShapeDtypeStruct((), jnp.float32)
     kind = jnp.uint8 if spaces.observation_kind == "image" else jnp.float32
     seen = jax.ShapeDtypeStruct((config.envs, *spaces.observation_shape), kind)
     vex = jax.ShapeDtypeStruct((config.envs,), jnp.float32)
-    init = partial(filter.init, config.envs, capacity)  # traced on the device alone
+    init = partial(filter.init, config.envs, capacity(config))  # traced on the device alone
     state = jax.eval_shape(init) if config.backend == "device" else init()
     key = jax.eval_shape(lambda: jax.random.key(0))
     hypers = Hypers(*[number] * len(Hypers._fields))

@@ -18,7 +18,7 @@ from sauna import checkpoint, rundir
 from sauna.config import ON_DEVICE, Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe
-from sauna.errors import BadInput, SaunaError, one_line
+from sauna.errors import BadInput, SaunaError
 from sauna.machines import Follower, check_shared, join, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
@@ -228,24 +228,16 @@ def _together(config: Config) -> bool:
 
 
 def _check_plugins(config: Config, spaces: Spaces) -> None:
-    """Builds and traces the program here where the user brought parts: a mistake is bad input then.
+    """Looks at what of a run is the user's own: a mistake there is bad input.
 
     Raises:
       BadInput: a part cannot be used.
     """
     if any(":" in name for name in (config.network, config.filter, config.vex_target)):
         configure_jax()
-        from sauna.collect.collected import capacity
-        from sauna.core.population import make_program
-        from sauna.plugins import check_parts
+        from sauna.plugins import check_plugins
 
-        try:
-            program = make_program(config, spaces)
-            check_parts(config, spaces, program.filter, capacity(config))
-        except BadInput:
-            raise
-        except Exception as error:  # a user's part fails in its own way
-            raise BadInput(f"a part of your own cannot be used: {one_line(error)}") from error
+        check_plugins(config, spaces)
 
 
 def settle(config: Config, spaces: Spaces) -> Config:

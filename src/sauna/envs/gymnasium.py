@@ -258,7 +258,7 @@ class GymnasiumEnvs(HostEnvs):
         for action in snapshot["actions"]:
             slot.actions.append(action)
             observation = slot.env.step(self._write(action))[0]
-            self._observation[index] = self._read(observation)
+            self._put(self._observation, index, observation)
         return self._observation[index].copy()
 
     def start_after(self, index: int, snapshot: Snapshot) -> np.ndarray:

@@ -32,8 +32,8 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     first, second = make_env(env, env_kwargs), make_env(env, env_kwargs)
     try:
         spaces = describe(first.observation_space, first.action_space)
-        _play(first, seed=1)
-        differs = _difference(_play(first, seed=2), _play(second, seed=2))
+        _play(first, spaces, seed=1)
+        differs = _difference(_play(first, spaces, seed=2), _play(second, spaces, seed=2))
     except BadInput:
         raise
     except Exception as error:  # whatever a user's environment raises when played
@@ -98,16 +98,15 @@ def _arrays(tree: Any) -> Any:
     return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]
 
 
-def _play(env: Any, seed: int) -> list[tuple[np.ndarray, float, bool]]:
+def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, bool]]:
     """`STEPS` steps of random actions: `(observation, reward, ended)` of each."""
     reader = observation_reader(env.observation_space)
-    shape = describe(env.observation_space, env.action_space).observation_shape
 
     def read(observation: Any) -> np.ndarray:
         found = np.array(reader(observation))
-        if found.shape != shape:
-            raise ValueError(f"it says that observations are of shape {shape}, and gives "
-                             f"{found.shape}")  # fmt: skip
+        if found.shape != spaces.observation_shape:
+            raise ValueError(f"it says that observations are of shape {spaces.observation_shape}, "
+                             f"and gives {found.shape}")  # fmt: skip
         return found
 
     env.action_space.seed(seed)

@@ -224,7 +224,7 @@ def _verdicts(
         absent = Cell(cell.task, str(cell.baseline), "", None, [], 0, 0, 0)
         base = of_label.get(str(cell.baseline), absent)
         family = sum(other.baseline == cell.baseline for other in cells)
-        verdicts.append(_verdict(cell, base, comparison, _plural(family, "arm"), tasks))
+        verdicts.append(_verdict(cell, base, comparison, _family(family, "arms"), tasks))
     return verdicts
 
 
@@ -245,7 +245,7 @@ def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
         name: (cell.values("final_return"), other.values("final_return"))
         for name, (cell, other) in pairs.items()
     })  # fmt: skip
-    family = _plural(len(pairs), "comparison")
+    family = _family(len(pairs), "comparisons")
     return [_verdict(*pairs[name], comparison, family, tasks) for name, comparison in found.items()]
 
 
@@ -268,7 +268,7 @@ def _is_control(other: Cell, cell: Cell) -> bool:
 def _verdict(
     cell: Cell, base: Cell, comparison: Comparison, family: str, tasks: int
 ) -> dict[str, Any]:
-    """`family`: what the test is corrected for, as `4 arms`."""
+    """`family`: what the test is corrected for."""
     sentences = [
         _finding(cell, base, comparison, family),
         *_limits(cell, base, comparison, tasks),
@@ -280,8 +280,9 @@ def _verdict(
             "text": text}  # fmt: skip
 
 
-def _plural(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+def _family(number: int, what: str) -> str:
+    """`4 arms`; empty where a test is alone and nothing is corrected."""
+    return f"{number} {what}" if number > 1 else ""
 
 
 def _finding(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str:
@@ -291,8 +292,7 @@ def _finding(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str
     if kind == "too few" or chance is None or low is None or high is None:
         return _too_few(cell, base, comparison, family)
     said = f"{kind} than" if kind != "no evidence" else "no evidence of a difference from"
-    alone = family.startswith("1 ")
-    correction = "" if alone else f" after Holm's correction for {family}"
+    correction = f" after Holm's correction for {family}" if family else ""
     shown = [_shown(x, 2, 0.5) for x in (chance, low, high)]
     p = "< 0.001" if comparison.p < 0.001 else f"= {_shown(comparison.p, 3, ALPHA)}"
     return (
@@ -307,7 +307,7 @@ def _too_few(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str
         f"{cell.label}: too few seeds to say anything against {base.label} on {cell.task}: "
         f"{n} against {m} complete; at least {comparison.least} of each are needed"
     )
-    if not family.startswith("1 "):
+    if family:
         text += f" for {family}"
     if comparison.needed is not None:
         text += (
