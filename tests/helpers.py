@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from sauna.config import Config
+from sauna.config.presets import members, resolve
+from sauna.config.settings import Config
 from sauna.core.population import Program, make_program
 from sauna.member_state import flat_params
 from sauna.placement import look_at, placed
-from sauna.presets import members, resolve
 from sauna.run import settle
 from sauna.training import Job, train_members
 

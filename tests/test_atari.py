@@ -24,7 +24,7 @@ from sauna.envs.contract import HostEnvs, episode_seed
 from sauna.envs.gymnasium import env_maker, make_env
 from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 from sauna.training import make_envs
 from test_envs import assert_same_step
 

@@ -21,7 +21,7 @@ from sauna.device_program import MOST_PER_CALL
 from sauna.envs.contract import HostEnvs, Step
 from sauna.envs.gymnasium import EnvironmentFailure
 from sauna.envs.jax_env import advance, begin, flat
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 from sauna.training import NonFinite
 
 N = 3

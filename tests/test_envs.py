@@ -13,8 +13,8 @@ from sauna.envs.contract import HostEnvs, Step, episode_seed
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker, make_drawn_env
 from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
-from sauna.errors import BadInput
 from sauna.spaces import action_writer, describe, observation_reader
+from sauna.system.errors import BadInput
 from worlds import Scripted, Spaced
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from helpers import configured, equal, make_job, own, resumed, train_here
 from sauna.core.update import moved_threshold
-from sauna.errors import BadInput
 from sauna.member_state import Counters
 from sauna.selection import filters
 from sauna.selection.filters import (
@@ -31,6 +30,7 @@ from sauna.selection.filters import (
     scheduled,
     threshold_held,
 )
+from sauna.system.errors import BadInput
 from sauna.training import hypers_now
 from test_losses import hypers
 

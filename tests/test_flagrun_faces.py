@@ -23,7 +23,7 @@ from sauna.envs.flagrun.physics import anatomy, first_qpos, load_model, read_rob
 from sauna.envs.gymnasium import GymnasiumEnvs, env_maker
 from sauna.envs.jax_env import JaxEnv
 from sauna.envs.probe import probe
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 HOME = np.concatenate([[0, 0, 1.29, 1, 0, 0, 0], np.zeros(17)])  # upright, soles in the ground
 

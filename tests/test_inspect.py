@@ -20,10 +20,9 @@ import sauna
 from helpers import SMALL, configured, own
 from sauna.artifact import load_artifact
 from sauna.collect.collected import capacity
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.batch import make_batch
 from sauna.core.types import Hypers, Rollout
-from sauna.errors import BadInput
 from sauna.inspection.decided import advantages, decide
 from sauna.inspection.examined import (
     Inspection,
@@ -38,6 +37,7 @@ from sauna.inspection.played import MOST, SIDE, Pictures, Recorder, _played
 from sauna.selection.filters import decide as decide_stretch
 from sauna.selection.filters import make_filter
 from sauna.selection.vex import make_target
+from sauna.system.errors import BadInput
 from sauna.trained import TrainedPolicy
 from worlds import Drawn, Lives, Scripted
 

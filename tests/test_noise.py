@@ -17,7 +17,6 @@ from sauna.core.gradient import policy_gradient
 from sauna.core.normalize import Moments, normalize
 from sauna.core.policy import make_policy
 from sauna.core.update import minibatch_losses
-from sauna.errors import BadInput
 from sauna.measure import estimates, noise
 from sauna.measure.estimates import Gradients, estimate
 from sauna.measure.streams import (
@@ -31,6 +30,7 @@ from sauna.measure.streams import (
 from sauna.selection.vex import TARGETS
 from sauna.study.noise import extra, over_members, text_table, verdicts
 from sauna.study.spec import read_spec
+from sauna.system.errors import BadInput
 from test_losses import VECTOR, hypers, random_batch
 
 PAIRS = (("dropped", "coin"),)

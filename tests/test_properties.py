@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from helpers import configured
-from sauna import checkpoint
 from sauna.core.population import make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers
 from sauna.spaces import Spaces
+from sauna.system import checkpoint
 from test_advantages import random_rollout
 
 CONFIG = configured(rollout_steps=40, envs=3, minibatches=4, epochs=2, hidden="5", arm="sauna")

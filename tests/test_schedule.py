@@ -7,11 +7,11 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
-from sauna import rundir
 from sauna.study.schedule import Executor
 from sauna.study.spec import check, read_spec
 from sauna.study.units import Unit, units_of
 from sauna.study.view import DONE, FAILED, WAITING, Cell, StudyView
+from sauna.system import run_directory
 
 TWO = {"tasks": ["A-v0"], "seeds": 3, "steps": 10_000, "rollout_steps": 1000, "minibatches": 10,
        "arms": [{"label": "ppo"}, {"label": "sauna"}]}  # fmt: skip
@@ -36,7 +36,9 @@ class Broken(Executor):
                 self._left.remove(name)
             elif self.unlucky not in unit.seeds:
                 unit.run(self._folder).mkdir(parents=True)
-                rundir.write_json(unit.run(self._folder) / "summary.json", {"complete": True})
+                run_directory.write_json(
+                    unit.run(self._folder) / "summary.json", {"complete": True}
+                )
             self._end(name, "broken")
 
     def _tell_to_stop(self) -> None:
@@ -79,7 +81,7 @@ def test_a_coin_tries_again_with_its_source(tmp_path: Path, monkeypatch) -> None
     shutil.rmtree(places[0])
     monkeypatch.setattr(Broken, "unlucky", None)
     run(tmp_path, {**TWO, "arms": arms})
-    assert all(rundir.is_complete(place / "run") for place in places)
+    assert all(run_directory.is_complete(place / "run") for place in places)
     assert not list(tmp_path.rglob("failed.json"))
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sauna.errors import BadInput
 from sauna.measure.torso import SIDE, STILLS, clearest, pitch
 from sauna.study import torso
 from sauna.study.spec import load_spec, read_spec
 from sauna.study.units import seeds_per_unit, units_of
+from sauna.system.errors import BadInput
 from test_cli import sauna
 
 TORSO = {"name": "t", "measure": "torso", "tasks": ["HalfCheetah-v5"], "seeds": 6,

@@ -26,9 +26,10 @@ import jax
 import mujoco
 import numpy as np
 
-from sauna import rundir, training
+from sauna import training
 from sauna.bench.rates import ratio
 from sauna.collect.host import Collected, HostCollector
+from sauna.config.presets import members, resolve
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import TrainState
 from sauna.envs.contract import Step, episode_seed
@@ -36,9 +37,9 @@ from sauna.envs.gymnasium import env_maker
 from sauna.envs.mujoco import MujocoEnvs
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
-from sauna.presets import members, resolve
 from sauna.run import settle
-from sauna.worker import configure_jax
+from sauna.system import run_directory
+from sauna.system.jax_setup import configure_jax
 
 HERE = Path(__file__).parent
 RESULT = HERE.parent / "results" / "compiled_stepper.json"
@@ -524,9 +525,9 @@ def main() -> None:
     library = build()
     compiler = subprocess.run(["g++", "--version"], capture_output=True, text=True, check=True)
     result: dict[str, Any] = {
-        "machine": rundir.machine(),
-        "versions": rundir.versions() | {"g++": compiler.stdout.splitlines()[0]},
-        "git": rundir.git_revision(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions() | {"g++": compiler.stdout.splitlines()[0]},
+        "git": run_directory.git_revision(),
         "flags": FLAGS,
         "members": MEMBERS,
         "rollout_steps": resolve({"env": "Hopper-v5", "arm": "ppo"}).rollout_steps,
@@ -543,7 +544,7 @@ def main() -> None:
         for name, values in found["to_raw_c"].items():
             print(f"  {name:18} {values['median']:.3f} {values['low']:.3f} {values['high']:.3f}")
     result["load_average"]["end"] = os.getloadavg()[0]
-    rundir.write_json(RESULT, result)
+    run_directory.write_json(RESULT, result)
     write_tables(result)
     print(tables(result))
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sauna.api import Result, compare, load, resume, train
     from sauna.envs.jax_env import JaxEnv, Transition
-    from sauna.errors import BadInput, SaunaError
     from sauna.evaluation import evaluate
     from sauna.inspection.command import inspect
     from sauna.selection.filters import Filter
     from sauna.selection.vex import VexTarget
+    from sauna.system.errors import BadInput, SaunaError
 
 __version__ = "0.1.0"
 
@@ -19,8 +19,8 @@ __all__ = ["BadInput", "Filter", "JaxEnv", "Result", "SaunaError", "Transition",
            "compare", "evaluate", "inspect", "load", "resume", "train"]  # fmt: skip
 
 _HOMES = {
-    "BadInput": "sauna.errors",
-    "SaunaError": "sauna.errors",
+    "BadInput": "sauna.system.errors",
+    "SaunaError": "sauna.system.errors",
     "Result": "sauna.api",
     "compare": "sauna.api",
     "load": "sauna.api",

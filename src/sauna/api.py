@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sauna import local, rundir
 from sauna import run as runs
-from sauna.errors import BadInput
+from sauna.config import local
+from sauna.config.plugins import is_local, name_of
+from sauna.config.presets import COMPARED, parse_all
 from sauna.metrics.display import Display, PlainDisplay, make_display
-from sauna.names import name_of
-from sauna.presets import COMPARED, parse_all
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
 
 PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
 
@@ -25,12 +26,12 @@ class Result:
     @property
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of `metrics.jsonl`, one per iteration and member."""
-        return rundir.rows(self.path)
+        return run_directory.rows(self.path)
 
     @property
     def summary(self) -> dict[str, Any]:
         """`member name -> final numbers`, as in `summary.json`."""
-        return rundir.read_config_file(self.path / "summary.json")["members"]
+        return run_directory.read_config_file(self.path / "summary.json")["members"]
 
     def policy(self, member: int | str = 0) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`."""
@@ -51,8 +52,8 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
     Args:
       env: a Gymnasium id, `module:function`, or a function that makes an environment.
       quiet: show nothing.
-      **settings: any field of `sauna.config.Config` (`arm="sauna"`, `seeds=6`, `steps=1_000_000`);
-        functions, flax modules, filters and targets may be passed by value.
+      **settings: any field of `sauna.config.settings.Config` (`arm="sauna"`, `seeds=6`,
+        `steps=1_000_000`); functions, flax modules, filters and targets may be passed by value.
 
     Raises:
       BadInput: a setting is not usable; nothing was created.
@@ -103,7 +104,7 @@ def compare(
     for name in PARTS:
         if name in given:
             given[name] = name_of(given[name])
-            if given[name].startswith(local.__name__ + ":"):
+            if is_local(given[name]):
                 raise BadInput(f"{name}: other processes cannot import it; put it into a module")
     task = given.pop("env")
     spec = comparison(task, tuple(arms), parse_all(given))
@@ -149,10 +150,10 @@ def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:
     Raises:
       BadInput: a part is given that the run finds by name, or one is missing.
     """
-    config = rundir.read_config(path).get("config", {})
+    config = run_directory.read_config(path).get("config", {})
     for name in PARTS:
-        module, _, attribute = str(config.get(name)).partition(":")
-        if module == local.__name__:
+        attribute = str(config.get(name)).partition(":")[2]
+        if is_local(str(config.get(name))):
             if name in given:
                 setattr(local, attribute, given[name])
             elif not hasattr(local, attribute):

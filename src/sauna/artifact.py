@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna import checkpoint, rundir
-from sauna.config import Config
-from sauna.errors import BadInput, nearest
-from sauna.presets import stored_config
+from sauna.config.presets import stored_config
+from sauna.config.settings import Config
 from sauna.spaces import Spaces, describe, read_spaces
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput, nearest
 
 
 class Artifact(NamedTuple):
@@ -31,7 +31,7 @@ def load_artifact(
       BadInput: no run there, or no checkpoint yet.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
-    rundir.read_config(run)
+    run_directory.read_config(run)
     if iteration is None:
         loaded = checkpoint.load_newest(run / "checkpoints", warn)
     else:

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
-from sauna.errors import BadInput, Interrupted, SaunaError, nearest
-from sauna.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
+from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
+from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
+from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    from sauna.presets import RESUMABLE
+    from sauna.config.presets import RESUMABLE
 
     _add_fields(resume, list(RESUMABLE))
 
@@ -197,7 +197,7 @@ def _given_from(file: str | None) -> dict[str, Any]:
     """Settings of a `config.json` (of a run), or of a JSON file of plain settings."""
     if file is None:
         return {}
-    from sauna.rundir import read_config_file
+    from sauna.system.run_directory import read_config_file
 
     stored = read_config_file(Path(file))
     if "config" in stored and "given" in stored:
@@ -306,9 +306,8 @@ def _bench(values: dict[str, Any]) -> None:
         del given[name]
     from sauna.bench.command import bench, bench_scale, report
     from sauna.bench.device import bench_on_device, report_on_device, scale_on_device
+    from sauna.config.presets import plain, resolve
     from sauna.placement import placed
-    from sauna.presets import resolve
-    from sauna.run import plain
 
     native = placed(resolve(plain(given))).backend == "device"
     if native and values["scale"]:

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sauna import checkpoint, rundir, watch
-from sauna.config import Config, local_parts, to_json
-from sauna.errors import BadInput, Interrupted, SaunaError
+from sauna.config.settings import Config, local_parts, to_json
 from sauna.metrics.curve import draw_curve
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
-from sauna.signals import handled
-from sauna.watch import Watch
-from sauna.wire import Message, Worker, receive, start_thread, start_worker
+from sauna.system import checkpoint, run_directory, watchdog
+from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
+from sauna.system.signals import handled
+from sauna.system.watchdog import Watch
 from sauna.worker import serve, write_job
 
 if TYPE_CHECKING:
@@ -106,13 +106,13 @@ class Coordinator:
 
     def run(self) -> None:
         run = self._run
-        self._display.open(run.config, run.members, run.path, rundir.rows(run.path))
+        self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
             self._grant()
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None
-            self._save(self._last_iteration(), rundir.log_sizes(self._run.path))
+            self._save(self._last_iteration(), run_directory.log_sizes(self._run.path))
             draw_curve(self._run.path)
             self._write_summary(complete)
         if not complete:
@@ -180,7 +180,7 @@ class Coordinator:
             code = worker.process.wait()
             how = f"ended with exit code {code}"
             if number in self._watch.hung:
-                how = f"gave no sign of life for {watch.SILENCE:g} s and was killed"
+                how = f"gave no sign of life for {watchdog.SILENCE:g} s and was killed"
             raise SaunaError(
                 f"training process {number} ({worker.process.pid}) {how}; the last good "
                 f"checkpoint is kept, continue with: sauna resume {self._run.path}"
@@ -220,7 +220,7 @@ class Coordinator:
             self._write_rows(rows, [m.header["timing"] for m in messages.values()])
             self._iteration += 1
             if self._iteration % self._run.config.checkpoint_every == 0:
-                self._due.append((self._iteration, rundir.log_sizes(self._run.path)))
+                self._due.append((self._iteration, run_directory.log_sizes(self._run.path)))
         while self._due and self._all_states_of(self._due[0][0]):
             self._save(*self._due.pop(0))
 
@@ -269,7 +269,7 @@ class Coordinator:
 
     def _write_summary(self, complete: bool) -> None:
         last: dict[str, dict[str, Any]] = {}
-        for row in rundir.rows(self._run.path):
+        for row in run_directory.rows(self._run.path):
             last[row["member"]] = row
         kept = ("arm", "seed", "env_steps", "kept_steps", "episodes", "return_mean",
                 "return_mean_reported", "explained_variance")  # fmt: skip
@@ -277,7 +277,7 @@ class Coordinator:
             name: {key: row[key] for key in kept if key in row} for name, row in last.items()
         }
         text = "return_mean: mean training return (sampled actions) of the last 100 episodes"
-        rundir.write_json(
+        run_directory.write_json(
             self._run.path / "summary.json",
             {"complete": complete, "metric": text, "members": summary},
         )

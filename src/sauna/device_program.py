@@ -19,7 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from sauna.collect.collected import capacity
 from sauna.collect.device import Collecting, CollectState, Ends, Faults, collect, start
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.batch import make_batch
 from sauna.core.policy import Policy, make_policy
 from sauna.core.population import Keys

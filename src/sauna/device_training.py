@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna.collect.collected import Collected, Episode
-from sauna.config import Config, to_json
+from sauna.config.presets import Member
+from sauna.config.settings import Config, to_json
 from sauna.core.normalize import Moments
 from sauna.core.policy import Policy
 from sauna.core.population import member_keys
@@ -34,7 +35,6 @@ from sauna.device_program import (
 from sauna.envs.gymnasium import EnvironmentFailure
 from sauna.envs.jax_env import flat
 from sauna.envs.jax_native import make_jax_env
-from sauna.errors import BadInput
 from sauna.machines import check_shared, join, leave, read_place, same, share, tell
 from sauna.member_state import (
     Counters,
@@ -46,8 +46,8 @@ from sauna.member_state import (
     unpack_optimizer,
 )
 from sauna.metrics.rows import metrics_row
-from sauna.presets import Member
-from sauna.rundir import versions
+from sauna.system.errors import BadInput
+from sauna.system.run_directory import versions
 from sauna.training import Job, Reporter, check_finite, goes_on
 
 Arrays = dict[str, np.ndarray]

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sauna import rundir
 from sauna.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.envs.gymnasium import make_drawn_env, make_env
-from sauna.errors import BadInput, SaunaError, one_line
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, SaunaError, one_line
 
 if TYPE_CHECKING:
     from sauna.trained import TrainedPolicy
@@ -76,7 +76,7 @@ def evaluate(
         result["members"][name] = statistics(played)
     world.close()
     if env is None and member is None:
-        rundir.write_json(run / f"evaluation_{mode}.json", result)
+        run_directory.write_json(run / f"evaluation_{mode}.json", result)
     if video:
         result["video"] = str(film(run, artifact, chosen[0], env, deterministic, seed))
     return result

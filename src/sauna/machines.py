@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 
 class Place(NamedTuple):

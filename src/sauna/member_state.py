@@ -17,14 +17,14 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
-from sauna.checkpoint import BadCheckpoint
 from sauna.collect.collected import Collected
 from sauna.collect.host import HostCollector
 from sauna.core.normalize import Moments
 from sauna.core.policy import Policy
 from sauna.core.types import TrainState
 from sauna.envs.contract import HostEnvs
-from sauna.errors import SaunaError
+from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.errors import SaunaError
 
 WINDOW = 100  # episodes that the reported mean return covers, as in baselines and the paper
 

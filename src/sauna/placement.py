@@ -8,12 +8,12 @@ import json
 import os
 from pathlib import Path
 
-from sauna.config import Config, local_parts
+from sauna.config.settings import Config, local_parts
 from sauna.envs.native import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
-from sauna.errors import BadInput
 from sauna.machines import read_place
-from sauna.worker import configure_jax
+from sauna.system.errors import BadInput
+from sauna.system.jax_setup import configure_jax
 
 MOST_STEPS = 2**31 - 1  # that the device's counters hold
 

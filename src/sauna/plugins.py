@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 
 from sauna.collect.collected import capacity
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.population import make_program
 from sauna.core.types import Hypers
-from sauna.errors import BadInput, one_line
 from sauna.selection.filters import Filter
 from sauna.selection.vex import make_target
 from sauna.spaces import Spaces
+from sauna.system.errors import BadInput, one_line
 
 
 def check_plugins(config: Config, spaces: Spaces) -> None:

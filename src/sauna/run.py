@@ -14,38 +14,29 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sauna import checkpoint, rundir
-from sauna.config import ON_DEVICE, Config, check_read, local_parts, to_json
-from sauna.coordinator import Coordinator
-from sauna.envs.probe import Probe
-from sauna.errors import BadInput, SaunaError
-from sauna.machines import Follower, check_shared, join, read_place
-from sauna.metrics.display import Display
-from sauna.metrics.tensorboard import TensorBoard
-from sauna.placement import look_at, placed
-from sauna.presets import (
+from sauna.config.presets import (
     ARMS,
     RESUMABLE,
     Member,
     as_began,
     members,
     parse_all,
+    plain,
     resolve,
     stored_config,
 )
+from sauna.config.settings import ON_DEVICE, Config, check_read, local_parts, to_json
+from sauna.coordinator import Coordinator
+from sauna.envs.probe import Probe
+from sauna.machines import Follower, check_shared, join, read_place
+from sauna.metrics.display import Display
+from sauna.metrics.tensorboard import TensorBoard
+from sauna.placement import look_at, placed
 from sauna.spaces import Spaces
-from sauna.untrusted import JSON_BYTES
-from sauna.worker import configure_jax
-
-
-def plain(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a user gave, as JSON values; `None` is not given.
-
-    Raises:
-      BadInput: an unknown key, or a value that cannot be read.
-    """
-    parsed = parse_all({name: value for name, value in given.items() if value is not None})
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.jax_setup import configure_jax
+from sauna.system.safe_read import JSON_BYTES
 
 
 class Run:
@@ -65,7 +56,7 @@ class Run:
         self.spaces, self.differs = found
         self.members: list[Member] = members(config, given)
         self.drop_rates = drop_rates
-        self.held: IO[str] = rundir.lock(path)
+        self.held: IO[str] = run_directory.lock(path)
 
     def manifest(self) -> dict[str, Any]:
         return {
@@ -73,7 +64,7 @@ class Run:
             "given": self.given,
             "spaces": list(self.spaces),
             "members": [member.name for member in self.members],
-            "versions": rundir.versions(),
+            "versions": run_directory.versions(),
         }
 
 
@@ -90,7 +81,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     drop_rates = _drop_rates(members(config, given))
     TensorBoard.check(config)
     _check_plugins(config, found.spaces)
-    path = Path(config.out) if config.out else rundir.default_path(config.env, config.arm)
+    path = Path(config.out) if config.out else run_directory.default_path(config.env, config.arm)
     config = dataclasses.replace(config, out=str(path))
     stored = {
         "given": given,
@@ -98,17 +89,17 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
         "spaces": list(found.spaces),
         "drop_rates": drop_rates,
         "exact_resume": found.differs is None,
-        "versions": rundir.versions(),
-        "git": rundir.git_revision(),
-        "machine": rundir.machine(),
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
+        "machine": run_directory.machine(),
     }
     made = not path.exists()
     with _disk_errors(path):
-        rundir.create(path)
+        run_directory.create(path)
         run = Run(path, given, config, found, drop_rates, made)
         try:
-            rundir.create(path)  # again, now that it is ours: another may have been faster
-            rundir.write_json(path / "config.json", stored)
+            run_directory.create(path)  # again, now that it is ours: another may have been faster
+            run_directory.write_json(path / "config.json", stored)
         except BaseException:
             run.held.close()
             raise
@@ -276,7 +267,7 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     Raises:
       BadInput: it is not a run, is in use, or `changes` would change what is computed.
     """
-    stored = rundir.read_config(path)
+    stored = run_directory.read_config(path)
     for name in changes:
         if name not in RESUMABLE:
             raise BadInput(f"{name}: cannot be changed on resume (can: {', '.join(RESUMABLE)})")
@@ -314,14 +305,14 @@ def _drop_rates(everyone: list[Member]) -> list[list[float]]:
     source = everyone[0].config.drop_rate_from
     if not source:
         return []
-    arms = rundir.read_config(Path(source))["config"]["arm"]
+    arms = run_directory.read_config(Path(source))["config"]["arm"]
     filtered = [arm for arm in arms if ARMS[arm]["filter"] != "none"]
     if len(filtered) != 1:
         raise BadInput(f"drop_rate_from: {source} has {len(filtered)} filtered arms; it needs one")
-    if not rundir.is_complete(Path(source)):
+    if not run_directory.is_complete(Path(source)):
         raise BadInput(f"drop_rate_from: {source} is not complete")
     rates: dict[int, list[float]] = {}
-    for row in rundir.rows(Path(source)):
+    for row in run_directory.rows(Path(source)):
         if row["arm"] == filtered[0]:
             rates.setdefault(row["seed"], []).append(1.0 - row["keep_rate"])
     for member in everyone:
@@ -349,7 +340,7 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
             _train(run, display, resume, inexact)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
-            rundir.discard(run.path, run.made)
+            run_directory.discard(run.path, run.made)
         raise
     finally:
         run.held.close()
@@ -358,11 +349,11 @@ def train(run: Run, display: Display, *, resume: bool, inexact: bool = False) ->
 def _train(run: Run, display: Display, resume: bool, inexact: bool) -> None:
     loaded = None
     if resume:
-        if rundir.is_complete(run.path):
+        if run_directory.is_complete(run.path):
             display.say(f"{run.path} is complete; nothing to do")
             return
         loaded = _load(run, display)
-        rundir.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+        run_directory.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
     with Coordinator(run, display, loaded, inexact) as coordinator:
         coordinator.run()
 
@@ -378,7 +369,7 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
 
     def check(manifest: dict[str, Any]) -> None:
         _check_same(run.path, own, manifest)
-        rundir.check_logs(run.path, manifest["logs"])
+        run_directory.check_logs(run.path, manifest["logs"])
 
     loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
     before = loaded.manifest.get("versions", {}) if loaded else {}

@@ -16,19 +16,19 @@ import numpy as np
 
 from sauna.collect.collected import Collected, capacity
 from sauna.collect.host import HostCollector
-from sauna.config import Config
+from sauna.config.presets import Member
+from sauna.config.settings import Config
 from sauna.core.population import Keys, Program, make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers, TrainState
 from sauna.core.update import UpdateMetrics
 from sauna.envs.backend import in_process_envs
 from sauna.envs.contract import HostEnvs
 from sauna.envs.workers import ProcessEnvs
-from sauna.errors import SaunaError
 from sauna.member_state import Counters, pack_member, unpack_member
 from sauna.metrics.rows import metrics_row
-from sauna.presets import Member
 from sauna.selection.filters import scheduled
 from sauna.spaces import Spaces
+from sauna.system.errors import SaunaError
 
 Arrays = dict[str, np.ndarray]
 

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from sauna.errors import BadInput, SaunaError
-from sauna.wire import Shared, child_ends, receive, send
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.jax_setup import configure_jax
+from sauna.system.processes import Shared, child_ends, receive, send
 
 BEAT = 2.0  # seconds between two signs of life
 
@@ -99,35 +100,6 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
         send(outbox, {"kind": "failure", "message": traceback.format_exc()})
 
 
-def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
-    """One CPU thread per process, synchronous dispatch, and a compilation cache on disk.
-
-    With one thread the bits of a result do not depend on the number of cores; the small programs
-    here run faster, too. A process that already used JAX keeps its own thread count.
-
-    Args:
-      simulated: on a CPU, into how many devices it is divided; 0: it is one.
-      device: cpu or gpu.
-    """
-    platform = os.environ.get("JAX_PLATFORMS") or {"cpu": "cpu", "gpu": "cuda"}[device]
-    if platform == "cpu":
-        os.environ.setdefault("PJRT_NPROC", "1")
-    else:  # others may share it: memory is taken as it is needed, not three quarters at once
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    ours = "jax" not in sys.modules  # else the process has chosen
-    import jax
-
-    if ours:  # not in os.environ, which a later run of this process reads
-        jax.config.update("jax_platforms", platform)
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if simulated > 1 and platform == "cpu":
-        jax.config.update("jax_num_cpu_devices", simulated)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        jax.config.update("jax_compilation_cache_dir", os.path.join(base, "sauna", "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-
-
 def _device(config: Mapping[str, Any]) -> str:
     return "gpu" if config["backend"] == "device" and config["device"] == "gpu" else "cpu"
 
@@ -157,7 +129,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
     """The `Job` of a `write_job` header."""
     import json
 
-    from sauna.presets import members, stored_config
+    from sauna.config.presets import members, stored_config
     from sauna.spaces import read_spaces
     from sauna.training import Job
 

@@ -116,16 +116,16 @@ def without_checks(compiled: Callable[[], Callable[[], Any]]) -> Callable[[], An
 
 
 def main() -> int:
-    from sauna import rundir
-    from sauna.worker import configure_jax
+    from sauna.system import run_directory
+    from sauna.system.jax_setup import configure_jax
 
     configure_jax()
     found = {
         "host": {"env": HOST["env"], "members": {str(n): of_the_host(n) for n in MEMBERS}},
         "update": of_the_update(),
         "device": {"env": DEVICE["env"], "envs": DEVICE["envs"], "share": of_the_device()},
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
     }
     print(json.dumps(found, indent=1))
     RESULTS.write_text(json.dumps(found, indent=1) + "\n")

@@ -97,7 +97,7 @@ class Nursery:
               ) -> Process:  # fmt: skip
         """Starts `sauna ARGUMENTS`; not before `time.monotonic()` is `at`.
 
-        `silence` stands in for `watch.SILENCE`.
+        `silence` stands in for `watchdog.SILENCE`.
         """
         question = {"start": arguments, "log": str(log), "at": at, "silence": silence}
         return Forked(self, self.ask(question)["pid"], log)
@@ -174,7 +174,7 @@ class _ForkedWorker:
 def _fork_worker(module: str, environment: dict[str, str]) -> Any:
     """Stands in for `wire.start_worker`: the same pipes, no new interpreter."""
     from sauna import worker as served
-    from sauna.wire import Worker, child_ends
+    from sauna.system.processes import Worker, child_ends
 
     to_child_read, to_child_write = os.pipe()
     to_parent_read, to_parent_write = os.pipe()
@@ -224,9 +224,10 @@ def _run(arguments: list[str], log: str, at: float, silence: float) -> None:
         os.dup2(source, target)
     _close_all_but()
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    from sauna import cli, coordinator, watch
+    from sauna import cli, coordinator
+    from sauna.system import watchdog
 
-    coordinator.start_worker, watch.SILENCE = _fork_worker, silence
+    coordinator.start_worker, watchdog.SILENCE = _fork_worker, silence
     time.sleep(max(0.0, at - time.monotonic()))
     code = 0
     try:

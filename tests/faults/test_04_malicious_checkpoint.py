@@ -84,7 +84,7 @@ def main() -> None:
 
     import sauna.artifact
     import sauna.envs.gymnasium
-    from sauna.errors import SaunaError
+    from sauna.system.errors import SaunaError
 
     del gymnasium, safetensors, sauna
     place, number = Path(sys.argv[1]), int(sys.argv[2])

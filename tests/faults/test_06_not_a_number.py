@@ -19,7 +19,6 @@ from faults.canned import trained_here
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
 from jax_worlds import FIELDS, Poison, poisoned
-from sauna import checkpoint, rundir
 from sauna.collect.device import Faults, collect
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
@@ -38,7 +37,8 @@ from sauna.envs.contract import HostEnvs
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
 from sauna.envs.jax_env import flat
 from sauna.envs.workers import ProcessEnvs
-from sauna.errors import SaunaError
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import SaunaError
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 VALUES = ("nan", "inf", "-inf")
@@ -236,8 +236,8 @@ def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
         sauna.train("worlds:Poisoned", env_kwargs=kwargs, out=run, quiet=True, arm="ppo",
                     checkpoint_every=1, **{**SMALL, "steps": 3200})  # fmt: skip
     found = checkpoint.load_newest(run / "checkpoints", print)
-    assert found is not None and found.manifest["iteration"] == len(rundir.rows(run)) > 1
-    assert not rundir.is_complete(run)
+    assert found is not None and found.manifest["iteration"] == len(run_directory.rows(run)) > 1
+    assert not run_directory.is_complete(run)
 
 
 def test_a_recorded_training_that_fails_has_reported_nothing_of_the_iteration() -> None:

@@ -15,11 +15,12 @@ import pytest
 import sauna
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, Recorder, make_job
-from sauna import checkpoint, rundir, training
-from sauna.checkpoint import NotFinite, save_checkpoint
+from sauna import training
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import Batch, Hypers, Rollout, TrainState
-from sauna.errors import SaunaError
+from sauna.system import checkpoint, run_directory
+from sauna.system.checkpoint import NotFinite, save_checkpoint
+from sauna.system.errors import SaunaError
 
 FIELDS = ("observation", "action", "log_prob", "advantage", "return_", "value", "vex_target")
 VALUES = (np.nan, np.inf, -np.inf)
@@ -121,7 +122,7 @@ def test_the_run_stops_and_the_last_finite_checkpoint_is_kept(
     with pytest.raises(SaunaError, match="ppo/0: the update of iteration 2 is not finite"):
         sauna.train(lambda: Scripted(), out=run, quiet=True, arm="ppo", checkpoint_every=1, **SMALL)
     found = checkpoint.load_newest(run / "checkpoints", print)
-    assert found is not None and found.manifest["iteration"] == 2 == len(rundir.rows(run))
+    assert found is not None and found.manifest["iteration"] == 2 == len(run_directory.rows(run))
     assert all(np.isfinite(a).all() for a in found.arrays.values())
 
 

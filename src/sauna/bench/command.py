@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna import rundir
 from sauna.bench.peers import peer_rate, prepare, versions
 from sauna.bench.rates import (
     WARM_UP,
@@ -24,10 +23,10 @@ from sauna.bench.rates import (
     training_rate,
 )
 from sauna.bench.scale import scale
-from sauna.config import FIELDS, Config
-from sauna.errors import BadInput
-from sauna.presets import arm_config, resolve
-from sauna.run import plain
+from sauna.config.presets import arm_config, plain, resolve
+from sauna.config.settings import FIELDS, Config
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
 
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
 _FIELDS = [*FIELDS]
@@ -76,9 +75,9 @@ def bench(
         "preset": config.preset,
         "members": len(config.seeds) * len(config.arm),
         "processes": processes,
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
-        "git": rundir.git_revision(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
     }
     if against:
         _check_peer(config, given, against)
@@ -134,9 +133,9 @@ def bench_scale(
     return {
         "env": config.env,
         "arm": list(config.arm),
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
-        "git": rundir.git_revision(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
         "scale": scale(given, rounds, say),
     }
 

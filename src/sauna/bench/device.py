@@ -16,14 +16,14 @@ from functools import partial
 from statistics import median
 from typing import Any
 
-from sauna import rundir
 from sauna.bench.rates import ratio
-from sauna.config import Config
-from sauna.errors import BadInput, SaunaError
+from sauna.config.presets import members, plain, resolve
+from sauna.config.settings import Config
 from sauna.placement import MOST_STEPS, look_at, placed
-from sauna.presets import members, resolve
-from sauna.run import plain, settle
-from sauna.worker import configure_jax
+from sauna.run import settle
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.jax_setup import configure_jax
 
 # Numbers of environments that `--scale` tries, and of members.
 ENVS = {"cpu": (8, 32, 128), "gpu": (256, 512, 1024, 2048, 4096, 8192, 16384)}
@@ -75,9 +75,9 @@ def bench_on_device(
         "epochs": config.epochs,
         "hidden": list(config.hidden),
         "device": config.device,
-        "machine": {**rundir.machine(), "device": device_name(config)},
-        "versions": rundir.versions(),
-        "git": rundir.git_revision(),
+        "machine": {**run_directory.machine(), "device": device_name(config)},
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
         "rates": rates,
         "ratios": {n: ratio(rates["whole"], r) for n, r in rates.items() if n != "whole"},
         "compile_seconds": [each["compile_seconds"] for each in found],
@@ -161,9 +161,9 @@ def scale_on_device(
         "env": config.env,
         "arm": list(config.arm),
         "device": config.device,
-        "machine": {**rundir.machine(), "device": device_name(config)},
-        "versions": rundir.versions(),
-        "git": rundir.git_revision(),
+        "machine": {**run_directory.machine(), "device": device_name(config)},
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
         "scale": {
             axis: [
                 {"value": value, **{n: median(e[n] for e in each) for n in each[0]}, "rounds": each}

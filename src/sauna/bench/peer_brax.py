@@ -12,9 +12,9 @@ import sys
 import time
 from typing import Any
 
+from sauna.config.presets import resolve
 from sauna.placement import placed
-from sauna.presets import resolve
-from sauna.worker import configure_jax
+from sauna.system.jax_setup import configure_jax
 
 EPOCHS = 4  # the first holds the compilation
 

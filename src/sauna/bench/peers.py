@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-from sauna.errors import BadInput, SaunaError
+from sauna.system.errors import BadInput, SaunaError
 
 # What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy.
 PEERS = {

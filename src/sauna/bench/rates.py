@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from sauna import run as runs
-from sauna.config import Config
-from sauna.errors import SaunaError
-from sauna.presets import PRESETS, Member
+from sauna.config.presets import PRESETS, Member
+from sauna.config.settings import Config
+from sauna.system.errors import SaunaError
 
 WARM_UP = 2  # iterations that are not counted: imports, compilation, first pages of memory
 

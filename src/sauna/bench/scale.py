@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from sauna.bench.rates import WARM_UP, training_rate
-from sauna.presets import resolve
+from sauna.config.presets import resolve
 
 ENOUGH = 100_000  # env steps that a point is measured over, at least
 AXES: dict[str, tuple[int, ...]] = {

@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 
 from sauna import training
-from sauna.checkpoint import save_checkpoint
 from sauna.collect.host import HostCollector
+from sauna.config.presets import members, resolve
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import TrainState
 from sauna.envs import mujoco_tasks
@@ -28,8 +28,8 @@ from sauna.envs.mujoco_tasks import BatchTask
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
 from sauna.metrics.rows import metrics_row
-from sauna.presets import members, resolve
 from sauna.run import settle
+from sauna.system.checkpoint import save_checkpoint
 
 SECTIONS = ("physics", "environment", "normalisation", "inference", "filter", "bookkeeping",
             "update", "checks", "logging", "checkpoints")  # fmt: skip

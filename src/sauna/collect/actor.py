@@ -13,10 +13,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sauna.compiled import compiled
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.policy import Policy
 from sauna.spaces import Spaces
+from sauna.system.compiled import compiled
 
 
 class Actor(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.types import Rollout
 
 

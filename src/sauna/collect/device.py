@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from sauna.collect.collected import capacity
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.normalize import (
     Moments,
     initial_moments,

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sauna.compiled import compiled
 from sauna.core.normalize import EPSILON, Moments, initial_moments
+from sauna.system.compiled import compiled
 
 
 class ObservationMoments:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.advantages import gae
 from sauna.core.types import Array, Batch, Hypers, Rollout
 from sauna.selection.vex import VexTarget

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from sauna.config import Config
+from sauna.config.plugins import import_name
+from sauna.config.settings import Config
 from sauna.core.distributions import Distribution, bernoulli, gaussian, multi_categorical
 from sauna.core.networks import MLP, ActorCritic, NatureCNN
 from sauna.core.types import Array, Params, PolicyOutput
-from sauna.errors import BadInput
-from sauna.names import import_name
 from sauna.spaces import Spaces
+from sauna.system.errors import BadInput
 
 
 class Policy(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.batch import make_batch
 from sauna.core.policy import Policy, act, make_policy, score
 from sauna.core.types import Array, Batch, Hypers, Rollout, TrainState

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core import a2c
 from sauna.core.losses import Losses, combine, standardize, value_error, weighted_mean
 from sauna.core.policy import Policy

@@ -24,7 +24,7 @@ import numpy as np
 
 from sauna.envs.contract import Step
 from sauna.envs.gymnasium import GymnasiumEnvs, Slot
-from sauna.errors import BadInput, nearest
+from sauna.system.errors import BadInput, nearest
 
 PREFIX = "ALE/"
 FRAMES = 4  # per env step

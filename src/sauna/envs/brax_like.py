@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna.envs.jax_env import JaxEnv, Transition, ended_where_broken
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 
 class State(NamedTuple):

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from sauna.config.plugins import import_name
 from sauna.envs.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.native import is_native
-from sauna.errors import BadInput, SaunaError, nearest, one_line
-from sauna.names import import_name
 from sauna.spaces import action_writer, describe, observation_reader
+from sauna.system.errors import BadInput, SaunaError, nearest, one_line
 
 _GYMNASIUM_ID = re.compile(r"^(?:[\w.-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
 

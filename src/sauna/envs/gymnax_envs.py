@@ -11,7 +11,7 @@ import numpy as np
 from gymnax.environments import spaces
 
 from sauna.envs.jax_env import JaxEnv, Transition
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 
 class State(NamedTuple):

@@ -13,10 +13,10 @@ import importlib.util
 from collections.abc import Callable
 from typing import Any
 
-from sauna.config import NATIVE
+from sauna.config.plugins import import_name
+from sauna.config.settings import NATIVE
 from sauna.envs.jax_env import JaxEnv
-from sauna.errors import BadInput, nearest, one_line
-from sauna.names import import_name
+from sauna.system.errors import BadInput, nearest, one_line
 
 # What each backend's package is called where it is imported.
 PACKAGES = {"gymnax": "gymnax", "playground": "mujoco_playground", "brax": "brax",

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
-from sauna.compiled import compiled
 from sauna.envs.contract import Snapshot, Step
 from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, Slot
 from sauna.envs.mujoco_tasks import TASKS, Outcome, make_task
-from sauna.errors import one_line
+from sauna.system.compiled import compiled
+from sauna.system.errors import one_line
 
 ROOM = 1000  # steps of an episode that there is room for from the start
 

@@ -33,7 +33,7 @@ from gymnasium.envs.mujoco import (
 )
 from numba import types
 
-from sauna.compiled import compiled
+from sauna.system.compiled import compiled
 
 
 class Outcome(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from sauna.config import NATIVE
-from sauna.names import import_name
+from sauna.config.plugins import import_name
+from sauna.config.settings import NATIVE
 
 
 def is_native(env: str, env_kwargs: dict[str, Any]) -> bool:

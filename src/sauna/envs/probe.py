@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.envs.gymnasium import make_env
-from sauna.errors import BadInput, one_line
 from sauna.spaces import Spaces, describe, observation_reader
+from sauna.system.errors import BadInput, one_line
 
 STEPS = 25
 

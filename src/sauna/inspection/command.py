@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sauna.artifact import find_member, load_artifact
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 
 def inspect(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna.collect.collected import capacity
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.core.batch import advantages_over_all, advantages_over_kept, kept_rows
 from sauna.core.types import Array, Hypers, Rollout
 from sauna.selection.filters import (

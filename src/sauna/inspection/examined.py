@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sauna import rundir
 from sauna.artifact import Artifact
-from sauna.config import Config
+from sauna.config.presets import Member, as_began, members
+from sauna.config.settings import Config
 from sauna.core.normalize import Moments, scale_rewards
 from sauna.core.population import member_keys
 from sauna.core.types import Hypers, Rollout
@@ -21,7 +21,7 @@ from sauna.envs.gymnasium import make_env
 from sauna.inspection.decided import Decisions, advantages, decide, environments
 from sauna.inspection.played import Played, clock, open_world, play_episodes, play_steps
 from sauna.member_state import Counters, under
-from sauna.presets import Member, as_began, members
+from sauna.system import run_directory
 from sauna.trained import TrainedPolicy
 from sauna.training import hypers_now
 
@@ -86,7 +86,7 @@ def examine(
     reward = scaled(config, own, played.reward)
     stream = _stream(policy, played, reward, value, decisions.keep)
     points, shares = principal_components(played.observation)
-    rows = [row for row in rundir.rows(run)
+    rows = [row for row in run_directory.rows(run)
             if row["member"] == name and row["iteration"] < iteration]  # fmt: skip
     return Inspection(
         member=member,
@@ -113,7 +113,7 @@ def _hypers(
     run: Path, config: Config, index: int, iteration: int, own: Mapping[str, np.ndarray]
 ) -> Hypers:
     """The member's traced settings, at the checkpoint's iteration; `own` are its arrays."""
-    rates = rundir.read_config(run).get("drop_rates") or []
+    rates = run_directory.read_config(run).get("drop_rates") or []
     counters = Counters.from_arrays(own)
     return hypers_now(config, rates[index] if rates else [], counters, iteration)
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from sauna.envs.contract import episode_seed
 from sauna.envs.gymnasium import make_drawn_env, make_env
-from sauna.errors import BadInput, SaunaError
 from sauna.evaluation import choose_renderer, not_drawn, play
+from sauna.system.errors import BadInput, SaunaError
 from sauna.trained import TrainedPolicy
 
 SIDE = 192  # pixels of a picture's longer side

@@ -18,9 +18,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from sauna import rundir
-from sauna.errors import SaunaError
-from sauna.worker import configure_jax
+from sauna.system import run_directory
+from sauna.system.errors import SaunaError
+from sauna.system.jax_setup import configure_jax
 
 
 def measure(given: dict[str, Any]) -> None:
@@ -44,7 +44,7 @@ def measure(given: dict[str, Any]) -> None:
         else:
             found = coverage.measure(standing, scale)
         place = {"iteration": iteration, "env_steps": standing.env_steps}
-        rundir.write_json(Path(file), {**place, **found})
+        run_directory.write_json(Path(file), {**place, **found})
 
 
 def main() -> int:

@@ -17,18 +17,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sauna import rundir
-from sauna.checkpoint import load_checkpoint
 from sauna.collect.collected import capacity
 from sauna.collect.host import HostCollector
-from sauna.config import Config
+from sauna.config.presets import Member, as_began, members, stored_config
+from sauna.config.settings import Config
 from sauna.core.batch import advantages_over_all
 from sauna.core.population import Program, make_program, member_keys
 from sauna.core.types import Array, Hypers, Rollout
 from sauna.envs.backend import in_process_envs
 from sauna.member_state import Counters, fitting, flat_params, moments_of, under
-from sauna.presets import Member, as_began, members, stored_config
 from sauna.spaces import Spaces, read_spaces
+from sauna.system import run_directory
+from sauna.system.checkpoint import load_checkpoint
 from sauna.training import hypers_now
 
 WARM_UP = 2048  # env steps at most that are thrown away, so that no stream begins with a reset
@@ -79,7 +79,7 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     Raises:
       BadCheckpoint: the checkpoint cannot be trusted or read.
     """
-    stored = rundir.read_config(run)
+    stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     config = stored_config(loaded.manifest["config"])
     spaces = read_spaces(loaded.manifest["spaces"])

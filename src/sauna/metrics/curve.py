@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sauna import rundir, style
+from sauna import style
+from sauna.system import run_directory
 
 GRID = 100  # points at which members' curves are compared
 
@@ -41,12 +42,12 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def draw_curve(run: Path) -> Path | None:
     """Writes `figures/learning_curve.png`; None where no episode has finished."""
-    curves = member_curves(rundir.rows(run))
+    curves = member_curves(run_directory.rows(run))
     if not curves:
         return None
     from matplotlib.figure import Figure
 
-    config = rundir.read_config(run)["config"]
+    config = run_directory.read_config(run)["config"]
     looks = style.looks({arm: arm for arm in curves})
     with style.applied():
         figure = Figure(figsize=(7, 4.2), layout="tight")

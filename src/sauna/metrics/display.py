@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
-from sauna.config import Config
-from sauna.presets import Member
+from sauna.config.presets import Member
+from sauna.config.settings import Config
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sauna.config import Config
-from sauna.presets import Member
+from sauna.config.presets import Member
+from sauna.config.settings import Config
 
 if TYPE_CHECKING:
     from sauna.collect.collected import Collected

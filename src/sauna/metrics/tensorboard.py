@@ -6,8 +6,8 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-from sauna.config import Config
-from sauna.errors import BadInput
+from sauna.config.settings import Config
+from sauna.system.errors import BadInput
 
 
 class TensorBoard:

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sauna.config import Config
+from sauna.config.plugins import import_name
+from sauna.config.settings import Config
 from sauna.core.types import Array, Hypers
-from sauna.errors import BadInput
-from sauna.names import import_name
+from sauna.system.errors import BadInput
 
 EPSILON = 1e-8  # epsilon_0 of eq. 7
 

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sauna.config import Config
+from sauna.config.plugins import import_name
+from sauna.config.settings import Config
 from sauna.core.types import Array
-from sauna.errors import BadInput
-from sauna.names import import_name
+from sauna.system.errors import BadInput
 
 CLIP_BELOW = -5.0  # of the per-sample target, whose lower tail is unbounded
 # Variance over mean square below which equal float32 returns are told apart by rounding only.

@@ -18,12 +18,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sauna import __version__, rundir
-from sauna.errors import BadInput, SaunaError, one_line
+from sauna import __version__
 from sauna.study import mirror
 from sauna.study.node import Hub, Said, run_unit, version
 from sauna.study.schedule import Executor, View
 from sauna.study.units import Unit
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, SaunaError, one_line
 
 RETRIES = 5  # by Ray, of a task whose node or process was lost; then it counts as failed
 TOKENS = ("(its token belongs into the file RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token; "
@@ -148,15 +149,17 @@ class RayExecutor(Executor):
         self._tasks: dict[Any, str] = {}  # by what Ray knows them by
         self._began: set[str] = set()
         self._locks: dict[str, IO[str]] = {}
-        self._git = rundir.git_revision()
+        self._git = run_directory.git_revision()
         self._told = False
 
     def _start(self, unit: Unit) -> None:
         run = unit.run(self._folder)
         run.mkdir(parents=True, exist_ok=True)
         try:
-            self._locks[unit.name] = rundir.lock(run)
-        except rundir.InUse:  # by a local unit of a study that was killed: about to save and end
+            self._locks[unit.name] = run_directory.lock(run)
+        except (
+            run_directory.InUse
+        ):  # by a local unit of a study that was killed: about to save and end
             self._waiting.append(self._running.pop(unit.name))
             return
         given = unit.given(self._folder)

@@ -12,14 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna import rundir
-from sauna.config import Config
+from sauna.config.presets import algorithm_of, chosen_preset
+from sauna.config.settings import Config
 from sauna.envs.probe import Probe
-from sauna.errors import BadInput, Interrupted
 from sauna.placement import look_at, placed
-from sauna.presets import algorithm_of, chosen_preset
 from sauna.run import check_read_after_settling, settle
-from sauna.signals import handled
 from sauna.spaces import Spaces
 from sauna.study.local import LocalExecutor
 from sauna.study.measuring import gather_measured, items_of, measure
@@ -37,6 +34,9 @@ from sauna.study.units import (
     units_of,
 )
 from sauna.study.view import StudyView
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, Interrupted
+from sauna.system.signals import handled
 
 SEEDS = 6  # of a comparison, where none are given
 
@@ -215,7 +215,7 @@ def _held(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {folder}: {error.strerror}") from error
-    with rundir.lock(folder):
+    with run_directory.lock(folder):
         yield
 
 
@@ -242,7 +242,7 @@ def _note(spec: Spec, place: Path, size: int) -> None:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
-    rundir.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+    run_directory.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
 
 
 def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:
@@ -264,15 +264,15 @@ def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str
     extra = NOTHING
     if spec.measure:
         measured = gather_measured(spec, units, folder, place, results)
-        rundir.write_json(place / f"{spec.measure}.json", measured)
+        run_directory.write_json(place / f"{spec.measure}.json", measured)
         study = {"noise": noise, "dial": dial, "torso": torso}[spec.measure]
         summary["measured"] = study.verdicts(measured)
         summary["not_measured"] = sum(
             not item.is_done for item in items_of(spec, units, folder, place)
         )
         extra = torso.extra(measured, place) if study is torso else study.extra(measured)
-    rundir.write_json(place / "results.json", results)
-    rundir.write_json(place / "summary.json", summary)
+    run_directory.write_json(place / "results.json", results)
+    run_directory.write_json(place / "summary.json", summary)
     write_report(results, summary, place, extra)
     return summary
 

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna import rundir
-from sauna.checkpoint import numbered
 from sauna.study.process import Message, UnitProcess
 from sauna.study.spec import Spec, check, drops_nothing
 from sauna.study.statistics import area_under_curve
 from sauna.study.units import Unit, parts
+from sauna.system import run_directory
+from sauna.system.checkpoint import numbered
 
 # Shares of the budget at which each measurement is made, at the checkpoint nearest to it.
 ALONG = (0.05, 0.25, 0.5, 0.75, 1.0)
@@ -94,7 +94,7 @@ def _mark(run: Path, iteration: int) -> str:
 
 def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) -> dict[float, int]:
     """`{point: iteration}`: the checkpoint of a seed nearest to each point, none of them twice."""
-    rows = [row for row in rundir.rows(run) if row["seed"] == seed]
+    rows = [row for row in run_directory.rows(run) if row["seed"] == seed]
     reached = {
         int(path.name): max(
             (row["env_steps"] for row in rows if row["iteration"] < int(path.name)), default=0

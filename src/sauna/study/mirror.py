@@ -12,9 +12,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from sauna import rundir
+from sauna.system import run_directory
 
-LOGS = ("stderr.txt", *(f"run/{name}" for name in rundir.LOGS))
+LOGS = ("stderr.txt", *(f"run/{name}" for name in run_directory.LOGS))
 CHECKPOINTS = "run/checkpoints"
 LAST = "run/summary.json"  # says that everything else is there
 
@@ -121,9 +121,9 @@ def _grow(path: Path, start: int, data: bytes) -> None:
 def _replace_file(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.writing")
-    rundir.write_durably(temporary, data)
+    run_directory.write_durably(temporary, data)
     temporary.replace(path)
-    rundir.sync_folder(path.parent)
+    run_directory.sync_folder(path.parent)
 
 
 def _replace_folder(path: Path, files: dict[str, bytes]) -> None:
@@ -131,9 +131,9 @@ def _replace_folder(path: Path, files: dict[str, bytes]) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     for name, data in files.items():
-        rundir.write_durably(temporary / name, data)
-    rundir.sync_folder(temporary)
+        run_directory.write_durably(temporary / name, data)
+    run_directory.sync_folder(temporary)
     if path.exists():
         shutil.rmtree(path)
     temporary.rename(path)
-    rundir.sync_folder(path.parent)
+    run_directory.sync_folder(path.parent)

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sauna import rundir
-from sauna.config import flag, to_json
+from sauna.config.settings import flag, to_json
 from sauna.study.spec import Arm, Spec, check
 from sauna.study.statistics import area_under_curve
 from sauna.study.units import Unit, parts
+from sauna.system import run_directory
 
 FORMAT = 1
 POINTS = 60  # of each member's curve that are kept
@@ -93,7 +93,7 @@ def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
     found = []
     for part in parts(unit, folder):
         rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in part.seeds}
-        for row in rundir.rows(part.run(folder)):
+        for row in run_directory.rows(part.run(folder)):
             rows[row["seed"]].append(row)
         for seed in part.seeds:
             error = part.error(folder)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from sauna import rundir
 from sauna.study.units import Unit, mark_split, needs_split, parts, split
+from sauna.system import run_directory
 
 ATTEMPTS = 2  # a failed unit is continued once
 NO_RATES = "the arm whose drop rates it repeats failed"
@@ -106,7 +106,7 @@ class Executor(ABC):
                 self._start(unit)
 
     def _is_ready(self, source: str) -> bool:
-        return rundir.is_complete(self._folder / source / "run")
+        return run_directory.is_complete(self._folder / source / "run")
 
     def _source_failed(self, unit: Unit) -> bool:
         return unit.source is not None and (self._folder / unit.source / "failed.json").exists()
@@ -144,5 +144,5 @@ class Executor(ABC):
 
     def _give_up(self, unit: Unit, error: str) -> None:
         (self._folder / unit.name).mkdir(parents=True, exist_ok=True)
-        rundir.write_json(self._folder / unit.name / "failed.json", {"error": error})
+        run_directory.write_json(self._folder / unit.name / "failed.json", {"error": error})
         self._view.ended(unit, error)

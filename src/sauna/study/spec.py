@@ -31,9 +31,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna.config import FIELDS, Config, check_read, parse, to_json
-from sauna.errors import BadInput, nearest
-from sauna.presets import ARMS, DECIDED, FIXED, SHARED_RULES, arm_config, parse_all, resolve
+from sauna.config.presets import ARMS, DECIDED, FIXED, SHARED_RULES, arm_config, parse_all, resolve
+from sauna.config.settings import FIELDS, Config, check_read, parse, to_json
+from sauna.system.errors import BadInput, nearest
 
 _OWN = (*DECIDED, "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")

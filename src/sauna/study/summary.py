@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.config import Config
-from sauna.errors import BadInput
-from sauna.presets import ARMS
+from sauna.config.presets import ARMS
+from sauna.config.settings import Config
 from sauna.study.statistics import (
     ALPHA,
     POWER,
@@ -29,6 +28,7 @@ from sauna.study.statistics import (
     on_grid,
     performance_profile,
 )
+from sauna.system.errors import BadInput
 
 FORMAT = 1
 # Settings that two arms may differ in and yet differ in the choice of steps alone.

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from sauna import run as runs
-from sauna import rundir
-from sauna.config import Config, to_json
-from sauna.errors import Interrupted, SaunaError
-from sauna.presets import Member
+from sauna.config.presets import Member
+from sauna.config.settings import Config, to_json
+from sauna.system import run_directory
+from sauna.system.errors import Interrupted, SaunaError
 
 PATIENCE = 300.0  # seconds that a run may still be held by a process that is ending
 SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate")
@@ -83,7 +83,9 @@ def train(given: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay
         try:
             run = runs.reopen(path, {}, display) if resume else runs.start(given, display)
             break
-        except rundir.InUse:  # by a unit of a study that was killed: it is about to save and end
+        except (
+            run_directory.InUse
+        ):  # by a unit of a study that was killed: it is about to save and end
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.5)
@@ -94,11 +96,11 @@ def train(given: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay
 
 def _record(run: runs.Run, recorded: dict[str, Any]) -> None:
     """Notes places and revision as on the study's machine, where the run is kept."""
-    stored = rundir.read_config(run.path)
+    stored = run_directory.read_config(run.path)
     stored["git"] = recorded.pop("git")
     run.config = dataclasses.replace(run.config, **recorded)
     run.given = {**run.given, **recorded}
-    rundir.write_json(
+    run_directory.write_json(
         run.path / "config.json", {**stored, "config": to_json(run.config), "given": run.given}
     )
 

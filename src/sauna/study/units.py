@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna import rundir
-from sauna.config import Config, to_json
+from sauna.config.settings import Config, to_json
 from sauna.study.spec import Arm, Spec, check
+from sauna.system import run_directory
 
 SEEDS = 3  # per unit: members of one process share the cost of each vector step
 RULES = 1  # to be raised when a default changes, so that runs of before are not taken for new ones
@@ -54,7 +54,7 @@ class Unit(NamedTuple):
         return str(json.loads(path.read_text())["error"]) if path.is_file() else None
 
     def is_complete(self, folder: Path) -> bool:
-        return rundir.is_complete(self.run(folder))
+        return run_directory.is_complete(self.run(folder))
 
 
 def seeds_per_unit(spec: Spec, cores: int) -> int:
@@ -137,7 +137,7 @@ def split(unit: Unit, folder: Path) -> list[Unit]:
 def mark_split(unit: Unit, folder: Path) -> None:
     """Notes that the unit's seeds are trained one by one from now on."""
     (folder / unit.name).mkdir(parents=True, exist_ok=True)
-    rundir.write_json(folder / unit.name / "split.json", {"seeds": list(unit.seeds)})
+    run_directory.write_json(folder / unit.name / "split.json", {"seeds": list(unit.seeds)})
 
 
 def _is_split(place: Path) -> bool:

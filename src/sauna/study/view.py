@@ -8,12 +8,12 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from sauna import rundir
-from sauna.config import Config
+from sauna.config.settings import Config
 from sauna.metrics.display import duration
 from sauna.study.numbers import number
 from sauna.study.spec import Spec, check
 from sauna.study.units import Unit, parts
+from sauna.system import run_directory
 
 PLAIN_SECONDS = 30.0  # between two progress lines where there is no terminal
 LIVE_SECONDS = 0.25
@@ -99,7 +99,7 @@ class StudyView:
                     cell.failed |= set(part.seeds)
                 if part.is_complete(folder):
                     cell.complete |= set(part.seeds)
-                for row in rundir.rows(part.run(folder)):
+                for row in run_directory.rows(part.run(folder)):
                     cell.note(row, trained=False)
         self._first = (time.monotonic(), self._done())
         self._shown = 0.0

@@ -6,7 +6,7 @@ import json
 import typing
 from typing import Any
 
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 
 def read_value(name: str, value: Any, field_type: Any) -> Any:

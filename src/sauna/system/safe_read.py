@@ -14,7 +14,7 @@ import stat
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sauna.errors import SaunaError
+from sauna.system.errors import SaunaError
 
 JSON_BYTES = 2**22  # a manifest has a few thousand
 HEADER_BYTES = 2**26

@@ -7,7 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sauna.errors import BadInput, nearest, one_line
+from sauna.config import local
+from sauna.system.errors import BadInput, nearest, one_line
+
+LOCAL = local.__name__
+STORED_BEFORE = "sauna.local"  # its name in the runs of 0.1.0
 
 
 def import_name(key: str, path: str) -> Any:
@@ -17,6 +21,8 @@ def import_name(key: str, path: str) -> Any:
       BadInput: the module or the name does not exist, or importing it failed.
     """
     module_name, _, attribute = path.partition(":")
+    if is_local(path):
+        module_name = LOCAL
     if module_name.partition(".")[0] in sys.stdlib_module_names:
         raise BadInput(f"{key}: {module_name!r} is a part of Python, which no run may call")
     if "" not in sys.path and str(Path.cwd()) not in sys.path:
@@ -35,7 +41,7 @@ def name_of(thing: Any) -> str:
     """`module:name` of a function, class or object that a user passed by value.
 
     What other processes could not import by name (a lambda, something of `__main__`) is put into
-    `sauna.local`; a run with such a part trains in a thread of this process.
+    `sauna.config.local`; a run with such a part trains in a thread of this process.
     """
     if isinstance(thing, str):
         return thing
@@ -44,8 +50,11 @@ def name_of(thing: Any) -> str:
     importable = isinstance(module, str) and isinstance(name, str) and module != "__main__"
     if importable and getattr(sys.modules.get(str(module)), str(name), None) is thing:
         return f"{module}:{name}"
-    from sauna import local
-
     name = "".join(c if c.isalnum() else "_" for c in name or type(thing).__name__)
     setattr(local, name, thing)
-    return f"{local.__name__}:{name}"
+    return f"{LOCAL}:{name}"
+
+
+def is_local(path: str) -> bool:
+    """Whether `module:name` names a part that was passed by value."""
+    return path.partition(":")[0] in (LOCAL, STORED_BEFORE)

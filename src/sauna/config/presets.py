@@ -10,8 +10,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from sauna.config import FIELDS, Config, check_consistent, check_read, parse, to_json
-from sauna.errors import BadInput, nearest
+from sauna.config.settings import FIELDS, Config, check_consistent, check_read, parse, to_json
+from sauna.system.errors import BadInput, nearest
 
 # Schulman et al. (2017) and OpenAI baselines' defaults for MuJoCo are `Config`'s own defaults.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -292,3 +292,13 @@ def _drifted(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, A
         for name, value in stored.items()
         if name not in resolved or resolved[name] != value
     }
+
+
+def plain(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a user gave, as JSON values; `None` is not given.
+
+    Raises:
+      BadInput: an unknown key, or a value that cannot be read.
+    """
+    parsed = parse_all({name: value for name, value in given.items() if value is not None})
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}

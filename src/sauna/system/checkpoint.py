@@ -21,8 +21,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from sauna.errors import SaunaError
-from sauna.untrusted import JSON_BYTES, Untrusted, check_tensors, parse_object, read_file
+from sauna.system.errors import SaunaError
+from sauna.system.safe_read import JSON_BYTES, Untrusted, check_tensors, parse_object, read_file
 
 FORMAT = 1
 LARGEST = 2**34  # bytes of a state that are read at most

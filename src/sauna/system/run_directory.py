@@ -22,9 +22,9 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.checkpoint import BadCheckpoint, sync_folder, write_durably
-from sauna.errors import BadInput, SaunaError
-from sauna.untrusted import JSON_BYTES, Untrusted, parse_object, read_file
+from sauna.system.checkpoint import BadCheckpoint, sync_folder, write_durably
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.safe_read import JSON_BYTES, Untrusted, parse_object, read_file
 
 LOGS = ("metrics.jsonl", "timing.jsonl")
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sauna.wire import ThreadProcess, Worker
+from sauna.system.processes import ThreadProcess, Worker
 
 SILENCE = 300.0  # seconds without a sign of life; a library may well hold the GIL for a minute
 TURN = 0.5

@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sauna.errors import BadInput, nearest
-from sauna.names import import_name
-from sauna.values import read_value
+from sauna.config.parsing import read_value
+from sauna.config.plugins import import_name, is_local
+from sauna.system.errors import BadInput, nearest
 
 NATIVE = ("gymnax", "playground", "brax", "mjx")  # `NAME/...`: environments of the device alone
 ON_DEVICE = ("reset", "device", "devices", "distributed")  # fields that only the device reads
@@ -360,7 +360,7 @@ def check_consistent(config: Config) -> None:
 
 def local_parts(config: Config) -> list[str]:
     """The fields whose values were passed by value and only this process knows."""
-    return [name for name in FIELDS if str(getattr(config, name)).startswith("sauna.local:")]
+    return [name for name in FIELDS if is_local(str(getattr(config, name)))]
 
 
 def to_json(config: Config) -> dict[str, Any]:
