@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sauna.envs.gymnasium import make_env
+from sauna.envs.make import make_env
 from sauna.evaluation import choose_renderer
 from sauna.system import run_directory
 

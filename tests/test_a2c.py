@@ -18,9 +18,9 @@ from sauna.core.batch import make_batch
 from sauna.core.policy import make_policy, score
 from sauna.core.types import Batch
 from sauna.core.update import init_state, minibatch_losses, update
+from sauna.envs.spaces import Spaces
 from sauna.member_state import named_optimizer, unpack_optimizer
 from sauna.selection.vex import TARGETS
-from sauna.spaces import Spaces
 from sauna.study.command import comparison
 from sauna.study.spec import check, load_spec
 from sauna.system.checkpoint import BadCheckpoint

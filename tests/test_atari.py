@@ -18,10 +18,9 @@ from helpers import equal, make_job, resumed, train_here
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
 from sauna.core.types import Hypers
-from sauna.envs.atari import AtariEnv, AtariEnvs, game_of
-from sauna.envs.backend import in_process_envs
-from sauna.envs.contract import HostEnvs, episode_seed
-from sauna.envs.gymnasium import env_maker, make_env
+from sauna.envs.host.atari_envs import AtariEnv, AtariEnvs, game_of
+from sauna.envs.host.contract import HostEnvs, episode_seed
+from sauna.envs.make import env_maker, in_process_envs, make_env
 from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
 from sauna.system.errors import BadInput

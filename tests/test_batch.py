@@ -14,9 +14,9 @@ from sauna.core.policy import make_policy
 from sauna.core.population import Keys, make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers, Rollout
 from sauna.core.update import head_statistics, minibatch_losses
+from sauna.envs.spaces import Spaces
 from sauna.selection.filters import decide, empty_history, informative, random_drop, sauna_per_env
 from sauna.selection.vex import TARGETS
-from sauna.spaces import Spaces
 from test_advantages import random_rollout
 from test_losses import hypers, random_batch
 

@@ -16,7 +16,7 @@ from helpers import make_job
 from sauna.collect import actor, moments
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys, minibatch_order
-from sauna.envs import mujoco, mujoco_tasks
+from sauna.envs.host import mujoco_envs, mujoco_tasks
 from sauna.member_state import Counters
 from sauna.training import _hypers, _learn, _limit, make_envs
 
@@ -98,7 +98,7 @@ def test_nothing_is_compiled_after_the_first_iteration(arm: str) -> None:
     trainer = Trainer("InvertedPendulum-v5", arm=arm, rollout_steps=256, **settings)
     trainer.iterate(0)
     trainer.changed = {"threshold": np.float32(1.0)}
-    loops = [actor._act, moments._see_and_normalize, mujoco._record, mujoco_tasks._advance]
+    loops = [actor._act, moments._see_and_normalize, mujoco_envs._record, mujoco_tasks._advance]
     variants = [len(loop.signatures) for loop in loops]
     compiled: list[str] = []
     listen = jax.monitoring.register_event_duration_secs_listener

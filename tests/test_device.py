@@ -18,9 +18,9 @@ from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
 from sauna.core.types import Hypers
 from sauna.device_program import MOST_PER_CALL
-from sauna.envs.contract import HostEnvs, Step
-from sauna.envs.gymnasium import EnvironmentFailure
-from sauna.envs.jax_env import advance, begin, flat
+from sauna.envs.device.contract import advance, begin, flat
+from sauna.envs.host.contract import HostEnvs, Step
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.errors import BadInput
 from sauna.training import NonFinite
 

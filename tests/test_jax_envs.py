@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from helpers import Recorder, make_job
-from sauna.envs.gymnasium import make_env
-from sauna.envs.jax_env import flat
-from sauna.envs.jax_native import make_jax_env
+from sauna.envs.device.contract import flat
+from sauna.envs.device.make import make_jax_env
+from sauna.envs.make import make_env
 from sauna.envs.probe import probe_on_device
 from sauna.system import run_directory
 from sauna.system.errors import BadInput

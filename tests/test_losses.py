@@ -14,8 +14,8 @@ from sauna.core.policy import make_policy
 from sauna.core.population import minibatch_order
 from sauna.core.types import Batch, Hypers
 from sauna.core.update import init_state, minibatch_losses, update
+from sauna.envs.spaces import Spaces
 from sauna.selection.vex import TARGETS
-from sauna.spaces import Spaces
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 

@@ -18,8 +18,8 @@ from sauna.core.convolutions import LAYERS, convolutions
 from sauna.core.distributions import bernoulli, gaussian, multi_categorical
 from sauna.core.networks import NatureCNN
 from sauna.core.policy import make_policy
+from sauna.envs.spaces import Spaces
 from sauna.member_state import flat_params, named_params
-from sauna.spaces import Spaces
 from sauna.system.errors import BadInput
 
 VECTOR = Spaces("vector", (11,), "continuous", (3,), "", "")

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 from helpers import configured
 from sauna.core.population import make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers
-from sauna.spaces import Spaces
+from sauna.envs.spaces import Spaces
 from sauna.system import checkpoint
 from test_advantages import random_rollout
 

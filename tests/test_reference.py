@@ -17,8 +17,8 @@ import pytest
 from helpers import make_job
 from sauna.collect.host import HostCollector
 from sauna.core.population import make_program, member_keys
-from sauna.envs.contract import episode_seed
-from sauna.envs.gymnasium import GymnasiumEnvs
+from sauna.envs.host.contract import episode_seed
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.member_state import Counters
 from sauna.training import _hypers, _limit
 from worlds import Scripted

@@ -21,7 +21,7 @@ from helpers import SMALL, environment
 from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
 from sauna.config.settings import parse
-from sauna.spaces import describe
+from sauna.envs.spaces import describe
 from sauna.study.command import _check_measurable, compare_command, comparison
 from sauna.study.process import UnitProcess
 from sauna.study.results import _ended

@@ -32,9 +32,9 @@ from sauna.collect.host import Collected, HostCollector
 from sauna.config.presets import members, resolve
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import TrainState
-from sauna.envs.contract import Step, episode_seed
-from sauna.envs.gymnasium import env_maker
-from sauna.envs.mujoco import MujocoEnvs
+from sauna.envs.host.contract import Step, episode_seed
+from sauna.envs.host.mujoco_envs import MujocoEnvs
+from sauna.envs.make import env_maker
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
 from sauna.run import settle

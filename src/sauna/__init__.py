@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sauna.api import Result, compare, load, resume, train
-    from sauna.envs.jax_env import JaxEnv, Transition
+    from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.evaluation import evaluate
     from sauna.inspection.command import inspect
     from sauna.selection.filters import Filter
@@ -26,8 +26,8 @@ _HOMES = {
     "load": "sauna.api",
     "resume": "sauna.api",
     "train": "sauna.api",
-    "JaxEnv": "sauna.envs.jax_env",
-    "Transition": "sauna.envs.jax_env",
+    "JaxEnv": "sauna.envs.device.contract",
+    "Transition": "sauna.envs.device.contract",
     "evaluate": "sauna.evaluation",
     "inspect": "sauna.inspection.command",
     "Filter": "sauna.selection.filters",

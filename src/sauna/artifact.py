@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from sauna.config.presets import stored_config
 from sauna.config.settings import Config
-from sauna.spaces import Spaces, describe, read_spaces
+from sauna.envs.spaces import Spaces, describe, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
 

@@ -344,11 +344,11 @@ def _list(values: dict[str, Any]) -> None:
             print(f"{backend}/...  (on the device; `sauna list {backend}` names them)")
         print("ALE/...  (`sauna list atari` names them)")
     elif what == "atari":
-        from sauna.envs.atari import names
+        from sauna.envs.host.atari_envs import names
 
         print("\n".join(names()))
     elif what in NATIVE:
-        from sauna.envs.jax_native import names_of
+        from sauna.envs.device.make import names_of
 
         for name in names_of(what):
             print(name)

@@ -25,11 +25,11 @@ from sauna.core.policy import Policy, make_policy
 from sauna.core.population import Keys
 from sauna.core.types import Array, Hypers, Rollout, TrainState
 from sauna.core.update import UpdateMetrics, init_state, learn
-from sauna.envs.jax_env import JaxEnv
+from sauna.envs.device.contract import JaxEnv
+from sauna.envs.spaces import Spaces
 from sauna.machines import shared_over
 from sauna.selection.filters import make_filter, scheduled
 from sauna.selection.vex import VexTarget, make_target
-from sauna.spaces import Spaces
 
 MOST_PER_CALL = 32  # iterations; their reports wait in the device's memory for the call's end
 MEMBERS, ENVS = "members", "envs"  # axes of the mesh

@@ -32,9 +32,9 @@ from sauna.device_program import (
     is_sound,
     make_mesh,
 )
-from sauna.envs.gymnasium import EnvironmentFailure
-from sauna.envs.jax_env import flat
-from sauna.envs.jax_native import make_jax_env
+from sauna.envs.device.contract import flat
+from sauna.envs.device.make import make_jax_env
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.machines import check_shared, join, leave, read_place, same, share, tell
 from sauna.member_state import (
     Counters,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sauna.artifact import Artifact, check_spaces, find_member, load_artifact
-from sauna.envs.gymnasium import make_drawn_env, make_env
+from sauna.envs.make import make_drawn_env, make_env
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError, one_line
 

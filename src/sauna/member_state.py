@@ -22,7 +22,7 @@ from sauna.collect.host import HostCollector
 from sauna.core.normalize import Moments
 from sauna.core.policy import Policy
 from sauna.core.types import TrainState
-from sauna.envs.contract import HostEnvs
+from sauna.envs.host.contract import HostEnvs
 from sauna.system.checkpoint import BadCheckpoint
 from sauna.system.errors import SaunaError
 

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 from sauna.config.settings import Config, local_parts
-from sauna.envs.native import is_native
+from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.machines import read_place
 from sauna.system.errors import BadInput

@@ -12,9 +12,9 @@ from sauna.collect.collected import capacity
 from sauna.config.settings import Config
 from sauna.core.population import make_program
 from sauna.core.types import Hypers
+from sauna.envs.spaces import Spaces
 from sauna.selection.filters import Filter
 from sauna.selection.vex import make_target
-from sauna.spaces import Spaces
 from sauna.system.errors import BadInput, one_line
 
 

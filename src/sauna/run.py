@@ -28,11 +28,11 @@ from sauna.config.presets import (
 from sauna.config.settings import ON_DEVICE, Config, check_read, local_parts, to_json
 from sauna.coordinator import Coordinator
 from sauna.envs.probe import Probe
+from sauna.envs.spaces import Spaces
 from sauna.machines import Follower, check_shared, join, read_place
 from sauna.metrics.display import Display
 from sauna.metrics.tensorboard import TensorBoard
 from sauna.placement import look_at, placed
-from sauna.spaces import Spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax

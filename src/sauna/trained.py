@@ -12,9 +12,9 @@ import numpy as np
 from sauna.artifact import Artifact, check_spaces, find_member
 from sauna.core.normalize import Moments, normalize
 from sauna.core.policy import Policy, make_policy
-from sauna.envs.gymnasium import make_env
+from sauna.envs.make import make_env
+from sauna.envs.spaces import action_writer, observation_reader
 from sauna.member_state import fitting, flat_params, under
-from sauna.spaces import action_writer, observation_reader
 
 CHUNK = 512  # observations of one call of `predict`: one compiled shape, and bounded memory
 

@@ -21,13 +21,13 @@ from sauna.config.settings import Config
 from sauna.core.population import Keys, Program, make_program, member_keys, minibatch_order
 from sauna.core.types import Hypers, TrainState
 from sauna.core.update import UpdateMetrics
-from sauna.envs.backend import in_process_envs
-from sauna.envs.contract import HostEnvs
+from sauna.envs.host.contract import HostEnvs
+from sauna.envs.make import in_process_envs
+from sauna.envs.spaces import Spaces
 from sauna.envs.workers import ProcessEnvs
 from sauna.member_state import Counters, pack_member, unpack_member
 from sauna.metrics.rows import metrics_row
 from sauna.selection.filters import scheduled
-from sauna.spaces import Spaces
 from sauna.system.errors import SaunaError
 
 Arrays = dict[str, np.ndarray]

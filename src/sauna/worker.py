@@ -130,7 +130,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
     import json
 
     from sauna.config.presets import members, stored_config
-    from sauna.spaces import read_spaces
+    from sauna.envs.spaces import read_spaces
     from sauna.training import Job
 
     config = stored_config(header["config"])

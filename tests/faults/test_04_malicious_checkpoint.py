@@ -69,7 +69,7 @@ def _resident(field: str) -> int:
 def _load(run: Path) -> None:
     """What `sauna eval` does before it makes a network."""
     from sauna.artifact import load_artifact
-    from sauna.envs.gymnasium import env_maker
+    from sauna.envs.make import env_maker
 
     said: list[str] = []
     artifact = load_artifact(run, said.append)
@@ -83,7 +83,7 @@ def main() -> None:
     import safetensors.numpy
 
     import sauna.artifact
-    import sauna.envs.gymnasium
+    import sauna.envs.host.gymnasium_envs
     from sauna.system.errors import SaunaError
 
     del gymnasium, safetensors, sauna

@@ -33,9 +33,10 @@ from sauna.device_program import (
     several,
 )
 from sauna.device_training import _check_sound, _setting
-from sauna.envs.contract import HostEnvs
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
-from sauna.envs.jax_env import flat
+from sauna.envs.device.contract import flat
+from sauna.envs.host.contract import HostEnvs
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.make import env_maker
 from sauna.envs.workers import ProcessEnvs
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import SaunaError

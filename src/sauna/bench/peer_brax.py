@@ -35,7 +35,7 @@ def rate(given: dict[str, Any], iterations: int) -> float:
     if backend == "playground":
         from mujoco_playground import registry, wrapper
 
-        from sauna.envs.playground_envs import own_config
+        from sauna.envs.device.playground_envs import own_config
 
         own = own_config(name, kwargs)
         env = registry.load(name, config=own)

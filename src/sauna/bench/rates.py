@@ -81,8 +81,8 @@ def training_rate(settings: Mapping[str, Any]) -> float:
 
 def simulator(env: str) -> str | None:
     """What steps an environment: `raw mj_step`, `ale-py alone`, or None where it is not known."""
-    from sauna.envs.atari import is_atari
-    from sauna.envs.backend import is_mujoco
+    from sauna.envs.host.atari_envs import is_atari
+    from sauna.envs.make import is_mujoco
 
     if is_atari(env):
         return "ale-py alone"
@@ -123,7 +123,7 @@ def _step_physics(env: str, env_kwargs: dict[str, Any], seconds: float) -> float
     """Steps per second that this process's `mj_step` does, timed in blocks between resets."""
     import mujoco
 
-    from sauna.envs.gymnasium import make_env
+    from sauna.envs.make import make_env
 
     number, block = 3, 50
     envs = [make_env(env, env_kwargs) for _ in range(number)]
@@ -164,7 +164,7 @@ def _step_games(env: str, seconds: float) -> float:
     """Steps per second of ale-py's vector environment of as many games as the preset has."""
     from ale_py.vector_env import AtariVectorEnv
 
-    from sauna.envs.atari import game_of
+    from sauna.envs.host.atari_envs import game_of
 
     number, block = PRESETS["atari"]["envs"], 100
     games = AtariVectorEnv(game_of(env), number)

@@ -22,9 +22,9 @@ from sauna.collect.host import HostCollector
 from sauna.config.presets import members, resolve
 from sauna.core.population import Program, make_program, member_keys, minibatch_order
 from sauna.core.types import TrainState
-from sauna.envs import mujoco_tasks
-from sauna.envs.atari import AtariEnvs
-from sauna.envs.mujoco_tasks import BatchTask
+from sauna.envs.host import mujoco_tasks
+from sauna.envs.host.atari_envs import AtariEnvs
+from sauna.envs.host.mujoco_tasks import BatchTask
 from sauna.envs.probe import probe
 from sauna.member_state import Counters
 from sauna.metrics.rows import metrics_row

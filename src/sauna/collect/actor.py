@@ -15,7 +15,7 @@ import numpy as np
 
 from sauna.config.settings import Config
 from sauna.core.policy import Policy
-from sauna.spaces import Spaces
+from sauna.envs.spaces import Spaces
 from sauna.system.compiled import compiled
 
 

@@ -29,7 +29,7 @@ from sauna.core.normalize import (
 from sauna.core.policy import Policy
 from sauna.core.population import Keys, draw_noise
 from sauna.core.types import Array, Hypers, Rollout
-from sauna.envs.jax_env import JaxEnv, Running, Transition, advance, begin
+from sauna.envs.device.contract import JaxEnv, Running, Transition, advance, begin
 from sauna.selection.filters import Filter
 
 WINDOW = 100  # finished episodes of one iteration that are reported one by one, the latest

@@ -26,8 +26,8 @@ from sauna.core.normalize import (
 )
 from sauna.core.population import Keys, Program
 from sauna.core.types import Hypers, Rollout
-from sauna.envs.contract import HostEnvs, Step
-from sauna.spaces import Spaces
+from sauna.envs.host.contract import HostEnvs, Step
+from sauna.envs.spaces import Spaces
 
 _fold_in = jax.jit(jax.random.fold_in)  # compiled: rollouts of few steps draw a key often
 

@@ -17,7 +17,7 @@ from sauna.config.settings import Config
 from sauna.core.distributions import Distribution, bernoulli, gaussian, multi_categorical
 from sauna.core.networks import MLP, ActorCritic, NatureCNN
 from sauna.core.types import Array, Params, PolicyOutput
-from sauna.spaces import Spaces
+from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
 
 

@@ -14,9 +14,9 @@ from sauna.core.batch import make_batch
 from sauna.core.policy import Policy, act, make_policy, score
 from sauna.core.types import Array, Batch, Hypers, Rollout, TrainState
 from sauna.core.update import UpdateMetrics, init_state, learn
+from sauna.envs.spaces import Spaces
 from sauna.selection.filters import Filter, decide, make_filter
 from sauna.selection.vex import make_target
-from sauna.spaces import Spaces
 
 
 class Program(NamedTuple):

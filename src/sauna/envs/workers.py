@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from sauna.envs.backend import in_process_envs
-from sauna.envs.contract import HostEnvs, Snapshot, Step
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
-from sauna.spaces import read_spaces
+from sauna.envs.host.contract import HostEnvs, Snapshot, Step
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.make import in_process_envs
+from sauna.envs.spaces import read_spaces
 from sauna.system.errors import SaunaError
 from sauna.system.processes import Message, child_ends, receive, send, start_worker
 

@@ -17,7 +17,7 @@ from sauna.config.settings import Config
 from sauna.core.normalize import Moments, scale_rewards
 from sauna.core.population import member_keys
 from sauna.core.types import Hypers, Rollout
-from sauna.envs.gymnasium import make_env
+from sauna.envs.make import make_env
 from sauna.inspection.decided import Decisions, advantages, decide, environments
 from sauna.inspection.played import Played, clock, open_world, play_episodes, play_steps
 from sauna.member_state import Counters, under

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.contract import episode_seed
-from sauna.envs.gymnasium import make_drawn_env, make_env
+from sauna.envs.host.contract import episode_seed
+from sauna.envs.make import make_drawn_env, make_env
 from sauna.evaluation import choose_renderer, not_drawn, play
 from sauna.system.errors import BadInput, SaunaError
 from sauna.trained import TrainedPolicy

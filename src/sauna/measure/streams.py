@@ -24,9 +24,9 @@ from sauna.config.settings import Config
 from sauna.core.batch import advantages_over_all
 from sauna.core.population import Program, make_program, member_keys
 from sauna.core.types import Array, Hypers, Rollout
-from sauna.envs.backend import in_process_envs
+from sauna.envs.make import in_process_envs
+from sauna.envs.spaces import Spaces, read_spaces
 from sauna.member_state import Counters, fitting, flat_params, moments_of, under
-from sauna.spaces import Spaces, read_spaces
 from sauna.system import run_directory
 from sauna.system.checkpoint import load_checkpoint
 from sauna.training import hypers_now

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sauna.artifact import Artifact
-from sauna.envs.gymnasium import make_drawn_env, make_env
+from sauna.envs.make import make_drawn_env, make_env
 from sauna.evaluation import choose_renderer, not_drawn, play
 from sauna.trained import TrainedPolicy
 

@@ -15,9 +15,9 @@ from typing import Any
 from sauna.config.presets import algorithm_of, chosen_preset
 from sauna.config.settings import Config
 from sauna.envs.probe import Probe
+from sauna.envs.spaces import Spaces
 from sauna.placement import look_at, placed
 from sauna.run import check_read_after_settling, settle
-from sauna.spaces import Spaces
 from sauna.study.local import LocalExecutor
 from sauna.study.measuring import gather_measured, items_of, measure
 from sauna.study.numbers import digits_of_tasks, interval, number

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sauna.envs.jax_env import JaxEnv, Transition, ended_where_broken
+from sauna.envs.device.contract import JaxEnv, Transition, ended_where_broken
 from sauna.system.errors import BadInput
 
 

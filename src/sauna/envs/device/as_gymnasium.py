@@ -11,7 +11,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from sauna.envs.jax_env import JaxEnv
+from sauna.envs.device.contract import JaxEnv
 
 # `split(key)[i]` is `fold_in(key, i)`: whoever plays an episode folds its env steps into the same
 # seed's key for the actions, and those must not be what the reset draws from.

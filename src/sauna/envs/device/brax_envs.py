@@ -6,8 +6,8 @@ from typing import Any
 
 from brax import envs
 
-from sauna.envs.brax_like import from_brax
-from sauna.envs.jax_env import JaxEnv
+from sauna.envs.device.brax_like import from_brax
+from sauna.envs.device.contract import JaxEnv
 
 
 def names() -> list[str]:

@@ -99,7 +99,7 @@ def _reader(space: Any) -> Callable[[Any], Array]:
     """The device's twin of `spaces.observation_reader`."""
     from gymnasium import spaces as gym
 
-    from sauna.spaces import describe_observation
+    from sauna.envs.spaces import describe_observation
 
     if isinstance(space, gym.Discrete):
         return lambda x: jax.nn.one_hot(x - space.start, int(space.n))

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from gymnax.environments import spaces
 
-from sauna.envs.jax_env import JaxEnv, Transition
+from sauna.envs.device.contract import JaxEnv, Transition
 from sauna.system.errors import BadInput
 
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
-from sauna.envs.contract import Snapshot, Step
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, Slot
-from sauna.envs.mujoco_tasks import TASKS, Outcome, make_task
+from sauna.envs.host.contract import Snapshot, Step
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs, Slot
+from sauna.envs.host.mujoco_tasks import TASKS, Outcome, make_task
 from sauna.system.compiled import compiled
 from sauna.system.errors import one_line
 

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from sauna.envs.jax_env import JaxEnv, Transition, ended_where_broken
+from sauna.envs.device.contract import JaxEnv, Transition, ended_where_broken
 
 
 class MjxTask(NamedTuple):

@@ -15,7 +15,7 @@ from typing import Any
 
 from sauna.config.plugins import import_name
 from sauna.config.settings import NATIVE
-from sauna.envs.jax_env import JaxEnv
+from sauna.envs.device.contract import JaxEnv
 from sauna.system.errors import BadInput, nearest, one_line
 
 # What each backend's package is called where it is imported.
@@ -63,7 +63,7 @@ def names_of(backend: str) -> list[str]:
 def _module(backend: str) -> Any:
     if not _is_installed(backend):
         raise BadInput(f"env: {backend} is not installed; `pip install 'sauna-rl[{backend}]'`")
-    return importlib.import_module(f"sauna.envs.{backend}_envs")
+    return importlib.import_module(f"sauna.envs.device.{backend}_envs")
 
 
 def _known() -> str:

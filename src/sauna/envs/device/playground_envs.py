@@ -7,8 +7,8 @@ from typing import Any
 
 from mujoco_playground import registry
 
-from sauna.envs.brax_like import from_brax
-from sauna.envs.jax_env import JaxEnv
+from sauna.envs.device.brax_like import from_brax
+from sauna.envs.device.contract import JaxEnv
 
 
 def names() -> list[str]:

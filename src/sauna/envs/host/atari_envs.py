@@ -22,8 +22,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from sauna.envs.contract import Step
-from sauna.envs.gymnasium import GymnasiumEnvs, Slot
+from sauna.envs.host.contract import Step
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs, Slot
 from sauna.system.errors import BadInput, nearest
 
 PREFIX = "ALE/"
