@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.bench.rates import alternate, ratio, training_rate
-from sauna.bench.scale import draw
+from sauna.experiments.bench.rates import alternate, ratio, training_rate
+from sauna.experiments.bench.scale import draw
 from sauna.system import run_directory
 
 ROOT = Path(__file__).parent.parent

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.study.numbers import interval
-from sauna.study.statistics import Estimate, compare, improvement_over_tasks
-from sauna.study.summary import MORE_STEPS, UNFILTERED
-from sauna.study.tables import PAPER, unversioned
+from sauna.experiments.report.numbers import interval
+from sauna.experiments.statistics import Estimate, compare, improvement_over_tasks
+from sauna.experiments.study.summary import MORE_STEPS, UNFILTERED
+from sauna.experiments.study.tables import PAPER, unversioned
 
 VARIANTS = ("sauna", "sauna 0.8", "sauna-paper")
 REFERENCES = ("sauna-reference", "sauna-reference, kept steps")

@@ -24,21 +24,25 @@ from typing import Any
 import numpy as np
 from claims import HEADER, claims_rows, told
 
-from sauna.study import dial, noise, torso
-from sauna.study.figures import draw_plots, write_figures
-from sauna.study.numbers import digits_of, digits_of_tasks, interval, number
-from sauna.study.page import rounded
-from sauna.study.report import UNFOLDED
-from sauna.study.results import gather
-from sauna.study.spec import load_spec
-from sauna.study.summary import FILTERING, summarize
-from sauna.study.tables import PAPER, unversioned
-from sauna.study.units import units_of
+from sauna.experiments.measure import coverage_report, noise_report, posture_report
+from sauna.experiments.report.figures import draw_plots, write_figures
+from sauna.experiments.report.numbers import digits_of, digits_of_tasks, interval, number
+from sauna.experiments.report.page import rounded
+from sauna.experiments.study.report import UNFOLDED
+from sauna.experiments.study.results import gather
+from sauna.experiments.study.spec import load_spec
+from sauna.experiments.study.summary import FILTERING, summarize
+from sauna.experiments.study.tables import PAPER, unversioned
+from sauna.experiments.study.units import units_of
 
 ROOT = Path(__file__).parent.parent
 STUDIES = ("fig3", "cheetah30", "release", "a2c", "minatar", "pong")
 CLAIMED = ("fig3", "cheetah30", "release", "minatar")  # what the claims are held against
-MEASURED = {"noise": noise, "dial": dial, "fig5": torso}  # what `docs/why.md` tells
+MEASURED = {
+    "noise": noise_report,
+    "dial": coverage_report,
+    "fig5": posture_report,
+}  # what `docs/why.md` tells
 STILLS = ROOT / "docs" / "why" / "figures" / "stills.png"
 CURVES_OF_RETURNS = "learning_curves"  # the figure's name
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
@@ -325,9 +329,11 @@ def why() -> str:
         drawn = draw_plots(extra.plots, extra.looks, ROOT / "docs" / "why")
         parts.append(f"`{measured['command']}`")
         parts.append(_listed(study.verdicts(measured)))
-        if study is torso and STILLS.exists() and torso.shown_pair(measured):
+        if study is posture_report and STILLS.exists() and posture_report.shown_pair(measured):
             parts.append(f"![Stills of one pair](why/figures/{STILLS.name})")
-            parts.append(f"{torso.chosen(measured)} Of each its clearest episode in that posture.")
+            parts.append(
+                f"{posture_report.chosen(measured)} Of each its clearest episode in that posture."
+            )
         parts += [f"![{p.title}](why/figures/{p.name}.png)\n\n{p.caption}" for p in extra.plots]
         parts.append(_markdown(study.text_table(measured)))
         parts.append(study.ABOUT)

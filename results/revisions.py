@@ -21,9 +21,9 @@ from typing import Any
 
 from make import CURVES, ROOT, STUDIES, load
 
-from sauna.study.process import Message, UnitProcess
-from sauna.study.results import DIGITS
-from sauna.study.spec import Arm, load_spec
+from sauna.experiments.study.execute.process import Message, UnitProcess
+from sauna.experiments.study.results import DIGITS
+from sauna.experiments.study.spec import Arm, load_spec
 from sauna.system import run_directory
 
 PATH = ROOT / "results" / "revisions.json"

@@ -15,11 +15,11 @@ import pytest
 
 import sauna
 from helpers import SMALL, own
-from sauna.artifact import load_artifact
-from sauna.metrics.curve import interval, member_curves
+from sauna.experiments.evaluate.artifact import load_artifact
+from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.report.curve import interval, member_curves
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
-from sauna.trained import TrainedPolicy
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
@@ -209,7 +209,7 @@ def test_curves_and_their_interval() -> None:
 
 @pytest.mark.slow
 def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
-    from sauna.metrics import display
+    from sauna.training import display
 
     monkeypatch.setattr(display.sys.stdout, "isatty", lambda: True, raising=False)
     shown = display.make_display()
@@ -217,7 +217,7 @@ def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
     sauna_run = sauna.api.runs.start(
         {"env": "worlds:Finite", "out": str(tmp_path / "run"), **SMALL}, shown
     )
-    sauna.api.runs.train(sauna_run, shown, resume=False)
+    sauna.api.train_and_draw(sauna_run, shown, resume=False)
     text = capsys.readouterr().out
     for word in ("sauna/0", "env steps", "keep rate", "Vex mean", "Vex spread"):
         assert word in text

@@ -13,11 +13,11 @@ import pytest
 
 import sauna
 from helpers import SMALL
-from sauna import placement
-from sauna.device_program import make_mesh
-from sauna.machines import Place, read_place
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
+from sauna.training import prepare
+from sauna.training.loop.device_program import make_mesh
+from sauna.training.loop.multihost import Place, read_place
 
 SETTINGS = ["jax_worlds:walk", "--arm", "sauna", "--threshold", "0.9", "--envs", "8",
             "--rollout-steps", "32", "--minibatches", "4", "--epochs", "2", "--hidden", "8,8",
@@ -127,9 +127,9 @@ def test_a_gpu_that_is_hidden_is_not_used(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(placement.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(placement.Path, "exists", lambda path: "nvidia" in str(path))
-    assert placement.has_gpu() == usable
+    monkeypatch.setattr(prepare.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(prepare.Path, "exists", lambda path: "nvidia" in str(path))
+    assert prepare.has_gpu() == usable
 
 
 @pytest.mark.parametrize(

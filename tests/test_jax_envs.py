@@ -22,7 +22,7 @@ from sauna.envs.make import make_env
 from sauna.envs.probe import probe_on_device
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
-from sauna.training import train_members
+from sauna.training.worker import train_members
 
 slow = pytest.mark.slow
 # An environment of each backend, and how long its episodes may last here.

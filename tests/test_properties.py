@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from helpers import configured
-from sauna.core.population import make_program, member_keys, minibatch_order
-from sauna.core.types import Hypers
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import Hypers, member_keys
 from sauna.envs.spaces import Spaces
 from sauna.system import checkpoint
 from test_advantages import random_rollout

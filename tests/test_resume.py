@@ -11,12 +11,12 @@ import pytest
 
 import sauna
 from helpers import SMALL, equal, make_job, resumed, train_here
-from sauna import run as runs
 from sauna.config import presets
-from sauna.measure.streams import load_standing
-from sauna.metrics.display import make_display
+from sauna.experiments.measure.streams import load_standing
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.training import run as runs
+from sauna.training.display import make_display
 from worlds import Scripted
 
 WORLD = "worlds:Scripted"
@@ -144,7 +144,7 @@ def test_what_a_worker_finds_unusable_is_bad_input_and_leaves_nothing(
     def refuse(*given) -> None:
         raise BadInput("devices: 4 asked for, 1 are there")
 
-    monkeypatch.setattr("sauna.training.train_members", refuse)
+    monkeypatch.setattr("sauna.training.worker.train_members", refuse)
     with pytest.raises(BadInput, match="4 asked for"):
         sauna.train(lambda: Scripted(), out=tmp_path / "a" / "run", quiet=True, **SMALL)
     assert not (tmp_path / "a" / "run").exists()

@@ -22,12 +22,12 @@ from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
 from sauna.config.settings import parse
 from sauna.envs.spaces import describe
-from sauna.study.command import _check_measurable, compare_command, comparison
-from sauna.study.process import UnitProcess
-from sauna.study.results import _ended
-from sauna.study.spec import built_in, check, load_spec, read_spec
-from sauna.study.summary import summarize
-from sauna.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
+from sauna.experiments.study.command import _check_measurable, compare_command, comparison
+from sauna.experiments.study.execute.process import UnitProcess
+from sauna.experiments.study.results import _ended
+from sauna.experiments.study.spec import built_in, check, load_spec, read_spec
+from sauna.experiments.study.summary import summarize
+from sauna.experiments.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from test_cli import sauna, small_flags

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sauna.algorithm.learner.vex_targets import VexTarget
+    from sauna.algorithm.types import Filter
     from sauna.api import Result, compare, load, resume, train
     from sauna.envs.device.contract import JaxEnv, Transition
-    from sauna.evaluation import evaluate
-    from sauna.inspection.command import inspect
-    from sauna.selection.filters import Filter
-    from sauna.selection.vex import VexTarget
+    from sauna.experiments.evaluate.episodes import evaluate
+    from sauna.experiments.inspect.command import inspect
     from sauna.system.errors import BadInput, SaunaError
 
 __version__ = "0.1.0"
@@ -28,10 +28,10 @@ _HOMES = {
     "train": "sauna.api",
     "JaxEnv": "sauna.envs.device.contract",
     "Transition": "sauna.envs.device.contract",
-    "evaluate": "sauna.evaluation",
-    "inspect": "sauna.inspection.command",
-    "Filter": "sauna.selection.filters",
-    "VexTarget": "sauna.selection.vex",
+    "evaluate": "sauna.experiments.evaluate.episodes",
+    "inspect": "sauna.experiments.inspect.command",
+    "Filter": "sauna.algorithm.selection.vex_filter",
+    "VexTarget": "sauna.algorithm.learner.vex_targets",
 }
 
 

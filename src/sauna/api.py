@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sauna import run as runs
 from sauna.config import local
 from sauna.config.plugins import is_local, name_of
 from sauna.config.presets import COMPARED, parse_all
-from sauna.metrics.display import Display, PlainDisplay, make_display
+from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, Interrupted
+from sauna.training import run as runs
+from sauna.training.display import Display, PlainDisplay, make_display
+from sauna.training.train import train_run
 
 PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
 
@@ -66,8 +68,22 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
         given["out"] = str(settings["out"])
     display: Display = _Silent() if quiet else make_display()
     run = runs.start(given, display)
-    runs.train(run, display, resume=False)
+    train_and_draw(run, display, resume=False)
     return Result(run.path)
+
+
+def train_and_draw(run: runs.Run, display: Display, *, resume: bool, inexact: bool = False) -> None:
+    """Trains a run to its end, or to where a signal stops it, and draws its learning curve.
+
+    Raises:
+      BadInput, Interrupted, SaunaError: as `train_run`.
+    """
+    try:
+        train_run(run, display, resume=resume, inexact=inexact)
+    except Interrupted:
+        draw_curve(run.path)
+        raise
+    draw_curve(run.path)
 
 
 def compare(
@@ -98,7 +114,7 @@ def compare(
     Raises:
       BadInput: something is not usable; nothing was created.
     """
-    from sauna.study.command import compare_command, comparison, study
+    from sauna.experiments.study.command import compare_command, comparison, study
 
     given = {"env": name_of(env), **settings}
     for name in PARTS:
@@ -127,7 +143,7 @@ def resume(
     display: Display = _Silent() if quiet else make_display()
     rest = _provide(Path(path), changes)
     run = runs.reopen(Path(path), rest, display)
-    runs.train(run, display, resume=True, inexact=inexact)
+    train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
@@ -138,8 +154,8 @@ def load(path: str | Path, member: int | str = 0, **parts: Any) -> Any:
     `parts` are those that were passed by value when the run started (`env`, `network`, ...).
     """
     _provide(Path(path), parts)
-    from sauna.artifact import load_artifact
-    from sauna.trained import TrainedPolicy
+    from sauna.experiments.evaluate.artifact import load_artifact
+    from sauna.experiments.evaluate.policy import TrainedPolicy
 
     return TrainedPolicy(load_artifact(Path(path)), member)
 

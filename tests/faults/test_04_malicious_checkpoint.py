@@ -68,8 +68,8 @@ def _resident(field: str) -> int:
 
 def _load(run: Path) -> None:
     """What `sauna eval` does before it makes a network."""
-    from sauna.artifact import load_artifact
     from sauna.envs.make import env_maker
+    from sauna.experiments.evaluate.artifact import load_artifact
 
     said: list[str] = []
     artifact = load_artifact(run, said.append)
@@ -82,8 +82,8 @@ def main() -> None:
     import gymnasium
     import safetensors.numpy
 
-    import sauna.artifact
     import sauna.envs.host.gymnasium_envs
+    import sauna.experiments.evaluate.artifact
     from sauna.system.errors import SaunaError
 
     del gymnasium, safetensors, sauna

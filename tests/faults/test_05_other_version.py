@@ -17,9 +17,9 @@ from faults.canned import BACKENDS, Trap, played_back, record, trained_here, unt
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
-from sauna.artifact import load_artifact
 from sauna.config.presets import RESUMABLE
 from sauna.config.settings import FIELDS, TYPES
+from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 

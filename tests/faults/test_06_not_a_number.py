@@ -19,11 +19,19 @@ from faults.canned import trained_here
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
 from jax_worlds import FIELDS, Poison, poisoned
-from sauna.collect.device import Faults, collect
-from sauna.collect.host import HostCollector
-from sauna.core.population import make_program, member_keys
-from sauna.core.types import Hypers
-from sauna.device_program import (
+from sauna.algorithm.rollout.device import Faults, collect
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import Hypers, member_keys
+from sauna.envs.device.contract import flat
+from sauna.envs.host.contract import HostEnvs
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.make import env_maker
+from sauna.envs.workers import ProcessEnvs
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import SaunaError
+from sauna.training.loop.device import _check_sound, _setting
+from sauna.training.loop.device_program import (
     MemberState,
     Parts,
     Report,
@@ -32,14 +40,6 @@ from sauna.device_program import (
     make_parts,
     several,
 )
-from sauna.device_training import _check_sound, _setting
-from sauna.envs.device.contract import flat
-from sauna.envs.host.contract import HostEnvs
-from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
-from sauna.envs.make import env_maker
-from sauna.envs.workers import ProcessEnvs
-from sauna.system import checkpoint, run_directory
-from sauna.system.errors import SaunaError
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 VALUES = ("nan", "inf", "-inf")

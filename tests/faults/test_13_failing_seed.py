@@ -14,10 +14,10 @@ from typing import Any
 from faults.nursery import environment
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL
-from sauna.study.command import write
-from sauna.study.schedule import Executor
-from sauna.study.spec import read_spec
-from sauna.study.units import Unit, units_of
+from sauna.experiments.study.command import write
+from sauna.experiments.study.execute.executor import Executor
+from sauna.experiments.study.spec import read_spec
+from sauna.experiments.study.units import Unit, units_of
 from sauna.system import run_directory
 
 SEEDS = 20

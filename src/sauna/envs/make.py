@@ -47,16 +47,16 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
         except Exception as error:
             raise BadInput(f"env: cannot import {module!r}: {one_line(error)}") from error
     if name.startswith("sauna/"):
-        _tame_mujoco()
+        tame_mujoco()
         importlib.import_module("sauna.envs.flagrun")
     if name not in gymnasium.registry:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
     if "mujoco" in str(gymnasium.registry[name].entry_point):
-        _tame_mujoco()
+        tame_mujoco()
     return lambda **more: gymnasium.make(name, disable_env_checker=True, **env_kwargs, **more)
 
 
-def _tame_mujoco() -> None:
+def tame_mujoco() -> None:
     """MuJoCo's warnings become Python's, instead of lines on stdout and a MUJOCO_LOG.TXT.
 
     What it calls deprecated is in the model files that Gymnasium ships: nothing for a user to mend.
