@@ -149,8 +149,9 @@ def ppo_table(results: dict[str, Any]) -> str:
 
 def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> str:
     """Every arm of a study as a Markdown table, the paper's numbers beside it."""
-    wanted = {(task, arm.label): len(arm.seeds) for arm in load_spec(name).arms
-              for task in arm.tasks}  # fmt: skip
+    wanted = {
+        (task, arm.label): len(arm.seeds) for arm in load_spec(name).arms for task in arm.tasks
+    }
     digits_of_task = digits_of_tasks(summary["table"])
     is_ppo = results["settings"].get("algorithm", "ppo") == "ppo"
     lines = [
@@ -234,9 +235,12 @@ def _same_runs(results: dict[str, Any]) -> str:
     said = []
     for task in dict.fromkeys(cell["task"] for cell in results["cells"]):
         cells = [cell for cell in results["cells"] if cell["task"] == task]
-        said += [f"On {task} `{a['label']}` and `{b['label']}` are the same runs up to where each "
-                 f"stops: what both are said to show was seen once."
-                 for a, b in itertools.combinations(cells, 2) if _agree(a, b)]  # fmt: skip
+        said += [
+            f"On {task} `{a['label']}` and `{b['label']}` are the same runs up to where each "
+            f"stops: what both are said to show was seen once."
+            for a, b in itertools.combinations(cells, 2)
+            if _agree(a, b)
+        ]
     return _listed(said)
 
 
@@ -316,9 +320,12 @@ def _missing(name: str, results: dict[str, Any]) -> str:
 
 def why() -> str:
     """`docs/why.md`, all of it from the result files; its figures are drawn on the way."""
-    parts = ["# Why it works, or does not", "Made by `python results/make.py`, as "
-             "[results.md](results.md) is. What is measured, and how, is told in "
-             "[studies.md](studies.md#measurements)."]  # fmt: skip
+    parts = [
+        "# Why it works, or does not",
+        "Made by `python results/make.py`, as "
+        "[results.md](results.md) is. What is measured, and how, is told in "
+        "[studies.md](studies.md#measurements).",
+    ]
     for name, study in MEASURED.items():
         parts.append(f"## {study.TITLE}")
         measured = load(name)
@@ -371,10 +378,15 @@ def figures(name: str, results: dict[str, Any]) -> None:
 def shown_figures(name: str) -> str:
     """The learning curves, and links to the report's other figures."""
     found = sorted((ROOT / "docs" / name / "figures").glob("*.svg"))
-    others = [f"[{path.stem.replace('_', ' ')}]({name}/figures/{path.name})" for path in found
-              if path.stem != CURVES_OF_RETURNS]  # fmt: skip
-    return (f"![Learning curves]({name}/figures/{CURVES_OF_RETURNS}.svg)\n\n"
-            f"More figures: {', '.join(others)}.")  # fmt: skip
+    others = [
+        f"[{path.stem.replace('_', ' ')}]({name}/figures/{path.name})"
+        for path in found
+        if path.stem != CURVES_OF_RETURNS
+    ]
+    return (
+        f"![Learning curves]({name}/figures/{CURVES_OF_RETURNS}.svg)\n\n"
+        f"More figures: {', '.join(others)}."
+    )
 
 
 def readmes_picture(results: dict[str, Any]) -> None:

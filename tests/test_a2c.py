@@ -158,12 +158,26 @@ def test_n_step_returns_are_lambda_1() -> None:
 def test_its_presets_are_the_published_numbers() -> None:
     config = resolve({"env": "x", "arm": "ppo", "algorithm": "a2c"})
     published = {
-        "preset": "a2c", "algorithm": "a2c", "rollout_steps": 5, "envs": 16, "minibatches": 1,
-        "epochs": 1, "learning_rate": 7e-4, "learning_rate_schedule": "linear",
-        "optimizer": "rmsprop", "rmsprop_decay": 0.99, "rmsprop_epsilon": 1e-5,
-        "value_coef": 0.5, "entropy_coef": 0.01, "max_grad_norm": 0.5, "gamma": 0.99,
-        "gae_lambda": 1.0, "normalize_advantages": False, "trunk": "shared", "hidden": (64, 64),
-    }  # fmt: skip
+        "preset": "a2c",
+        "algorithm": "a2c",
+        "rollout_steps": 5,
+        "envs": 16,
+        "minibatches": 1,
+        "epochs": 1,
+        "learning_rate": 7e-4,
+        "learning_rate_schedule": "linear",
+        "optimizer": "rmsprop",
+        "rmsprop_decay": 0.99,
+        "rmsprop_epsilon": 1e-5,
+        "value_coef": 0.5,
+        "entropy_coef": 0.01,
+        "max_grad_norm": 0.5,
+        "gamma": 0.99,
+        "gae_lambda": 1.0,
+        "normalize_advantages": False,
+        "trunk": "shared",
+        "hidden": (64, 64),
+    }
     assert {name: getattr(config, name) for name in published} == published
     assert resolve({"env": "x", "arm": "ppo", "preset": "a2c"}) == config
     other = resolve({"env": "x", "arm": "ppo", "preset": "a2c-mujoco"})
@@ -301,7 +315,8 @@ def test_cartpole_is_solved() -> None:
         def allowance(self, iteration: int) -> int:
             return 0 if len(best) == 3 and min(best.values()) > 475 else 1_000
 
-    job = job_of("ppo", "CartPole-v1", steps=500_000, seeds=3, envs=8, hidden="64,64",
-                 entropy_coef=0.0)  # fmt: skip
+    job = job_of(
+        "ppo", "CartPole-v1", steps=500_000, seeds=3, envs=8, hidden="64,64", entropy_coef=0.0
+    )
     train_members(job, UntilSolved())
     assert min(best.values()) > 475, best

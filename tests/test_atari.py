@@ -214,8 +214,15 @@ def test_a_time_limit_shows_what_was_reached() -> None:
 
 def test_a_lost_life_ends_what_is_learned_and_not_what_is_told() -> None:
     """Three lives of two steps, rewards 5 and -3; a rollout of 12 steps is two games."""
-    job = make_job("worlds:Lives", arm="ppo", rollout_steps=12, minibatches=1, steps=12,
-                   normalize_rewards=False, sign_rewards=True)  # fmt: skip
+    job = make_job(
+        "worlds:Lives",
+        arm="ppo",
+        rollout_steps=12,
+        minibatches=1,
+        steps=12,
+        normalize_rewards=False,
+        sign_rewards=True,
+    )
     program, keys = make_program(job.config, job.spaces), member_keys(0)
     collector = HostCollector(program, job.spaces, make_envs(job), [keys])
     collector.start()
@@ -240,9 +247,13 @@ class Coarse(nn.Module):
 
 
 ATARI = {
-    "preset": "atari", "network": "test_atari:Coarse", "envs": 2, "rollout_steps": 16,
-    "minibatches": 2, "epochs": 1,
-}  # fmt: skip
+    "preset": "atari",
+    "network": "test_atari:Coarse",
+    "envs": 2,
+    "rollout_steps": 16,
+    "minibatches": 2,
+    "epochs": 1,
+}
 
 
 def test_atari_trains_and_resumes_to_the_same_bytes() -> None:

@@ -42,8 +42,10 @@ def test_returns_and_targets_are_those_of_the_kept_steps(name: str) -> None:
     rollout = random_rollout(7, keep_rate=0.6)
     batch = make_batch(single(rollout), scalars(), config=CONFIG, target=TARGETS[name])
     advantage = np.asarray(advantages_over_all(single(rollout), scalars(), True))
-    columns = [np.asarray(x).reshape(40, 3) for x in (batch.return_, batch.log_prob, batch.value,
-                                                      batch.vex_target)]  # fmt: skip
+    columns = [
+        np.asarray(x).reshape(40, 3)
+        for x in (batch.return_, batch.log_prob, batch.value, batch.vex_target)
+    ]
     for n in range(3):
         keep = rollout.keep[:, n]
         return_, log_prob, value, target = (column[: keep.sum(), n] for column in columns)

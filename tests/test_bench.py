@@ -49,8 +49,13 @@ def test_inner_timers_are_taken_off_the_outer_ones(monkeypatch) -> None:
 
 
 def test_sections_add_up_to_a_training_of_a_filtered_arm() -> None:
-    settings = {"env": "InvertedPendulum-v5", "arm": "sauna", "rollout_steps": 64, "steps": 10**5,
-                "minibatches": 4}  # fmt: skip
+    settings = {
+        "env": "InvertedPendulum-v5",
+        "arm": "sauna",
+        "rollout_steps": 64,
+        "steps": 10**5,
+        "minibatches": 4,
+    }
     found = split(settings, 2)
     assert tuple(found) == SECTIONS
     assert all(value > 0 for value in found.values()), found
@@ -75,12 +80,16 @@ def test_points_of_a_scale_keep_the_batch() -> None:
 
 def test_the_report_shows_every_figure() -> None:
     result = {
-        "env": "Hopper-v5", "arm": ["ppo"], "members": 6, "processes": 2,
+        "env": "Hopper-v5",
+        "arm": ["ppo"],
+        "members": 6,
+        "processes": 2,
         "rates": {"training": [10.0, 20.0, 30.0], "physics": [40.0, 40.0, 40.0]},
         "ratios": {"physics": {"median": 0.5, "low": 0.25, "high": 0.75}},
         "split": {name: 1.0 for name in SECTIONS},
-        "seconds_to_first_env_step": 2.0, "peak_memory_mib": 300.0,
-    }  # fmt: skip
+        "seconds_to_first_env_step": 2.0,
+        "peak_memory_mib": 300.0,
+    }
     text = "\n".join(command.report(result))
     for piece in (
         "20 env steps/s",

@@ -15,9 +15,16 @@ TASKS = ("A-v5", "B-v5", "C-v5")
 
 
 def cell(task: str, label: str, scores: np.ndarray, keep_rate: float = 1.0) -> dict[str, Any]:
-    members = [{"status": "complete", "final_return": x, "area": -x, "keep_rate": keep_rate,
-                "env_steps": 1000.0}
-               for x in scores.tolist()]  # fmt: skip
+    members = [
+        {
+            "status": "complete",
+            "final_return": x,
+            "area": -x,
+            "keep_rate": keep_rate,
+            "env_steps": 1000.0,
+        }
+        for x in scores.tolist()
+    ]
     return {"task": task, "label": label, "members": members}
 
 
@@ -117,9 +124,13 @@ def test_more_env_steps_are_told() -> None:
 def test_a_sentence_for_each_claim() -> None:
     """An arm beside another than the claim's first pair has names it."""
     first, second = CLAIMS[0].text, CLAIMS[3].text
-    rows = [[first, "x", "ppo", "holds"], [first, "y", "ppo", "not decided"],
-            [first, "z", "ppo", "holds"], [first, "r", "ppo, limits end", "holds"],
-            [second, "x", "ppo", "holds"]]  # fmt: skip
+    rows = [
+        [first, "x", "ppo", "holds"],
+        [first, "y", "ppo", "not decided"],
+        [first, "z", "ppo", "holds"],
+        [first, "r", "ppo, limits end", "holds"],
+        [second, "x", "ppo", "holds"],
+    ]
     assert told(rows) == [
         f"**{first}.** `x`, `z`: holds. `y`: not decided. `r` (against `ppo, limits end`): holds.",
         f"**{second}.** `x`: holds.",

@@ -59,11 +59,14 @@ def study(tmp_path: Path) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (["--on", "ray"], "on: ray needs `pip install sauna-rl[cluster]`"),
-    (["--address", "auto"], "address: read with --on ray only"),
-    (["--on", "moon"], "invalid choice: 'moon'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--on", "ray"], "on: ray needs `pip install sauna-rl[cluster]`"),
+        (["--address", "auto"], "address: read with --on ray only"),
+        (["--on", "moon"], "invalid choice: 'moon'"),
+    ],
+)
 def test_what_is_missing_is_said_in_one_line(
     study, arguments, message, tmp_path, monkeypatch, capsys
 ) -> None:
@@ -135,17 +138,31 @@ def all_of(place: Path) -> dict[str, bytes]:
 
 def test_files_arrive_as_they_are(tmp_path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
-    put(here, {"run/config.json": "{}", "run/metrics.jsonl": "1\n", "run/.lock": "7",
-               "run/checkpoints/00000010/state.safetensors": "x" * 9,
-               "run/checkpoints/.writing-00000020/state.safetensors": "y"})  # fmt: skip
+    put(
+        here,
+        {
+            "run/config.json": "{}",
+            "run/metrics.jsonl": "1\n",
+            "run/.lock": "7",
+            "run/checkpoints/00000010/state.safetensors": "x" * 9,
+            "run/checkpoints/.writing-00000020/state.safetensors": "y",
+        },
+    )
     ray_files.write(there, all_of(here))
     tracker = ray_files.Tracker(there)  # knows what it was given
     put(there, {"run/metrics.jsonl": "1\n2\n", "stderr.txt": "warning"})
-    put(there, {"run/checkpoints/00000020/state.safetensors": "z",
-                "run/checkpoints/00000020/manifest.json": "{}"})  # fmt: skip
+    put(
+        there,
+        {
+            "run/checkpoints/00000020/state.safetensors": "z",
+            "run/checkpoints/00000020/manifest.json": "{}",
+        },
+    )
     first = tracker.changes()
-    assert sorted(first.files) == ["run/checkpoints/00000020/manifest.json",
-                                   "run/checkpoints/00000020/state.safetensors"]  # fmt: skip
+    assert sorted(first.files) == [
+        "run/checkpoints/00000020/manifest.json",
+        "run/checkpoints/00000020/state.safetensors",
+    ]
     ray_files.apply(here, first)
     assert all_of(here) == all_of(there)
 
@@ -215,9 +232,11 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (path / "local").mkdir()
     subprocess.run(
         [sys.executable, "-m", "sauna", "study", "../mine.toml", "--processes=2"],
-        cwd=path / "local", env={**os.environ, "PYTHONPATH": TESTS}, check=True,
+        cwd=path / "local",
+        env={**os.environ, "PYTHONPATH": TESTS},
+        check=True,
         stdout=subprocess.PIPE,
-    )  # fmt: skip
+    )
     return path / "local/runs"
 
 
@@ -231,9 +250,12 @@ class Place:
         (self.path / folder).mkdir(exist_ok=True)
         return subprocess.Popen(
             [sys.executable, "-m", "sauna", "study", "../mine.toml", *arguments],
-            cwd=self.path / folder, env=os.environ | changed, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
+            cwd=self.path / folder,
+            env=os.environ | changed,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
 
     def finish(self, started: subprocess.Popen[str], code: int = 0) -> str:
         out, errors = started.communicate(timeout=300)
@@ -406,9 +428,16 @@ def test_through_rays_client(place: Place, local: Path) -> None:
         port = free.getsockname()[1]
     ray = [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--port=0"]
     server = subprocess.Popen(
-        [*ray, "--node-ip-address=127.0.0.1", f"--ray-client-server-port={port}", "--num-cpus=2",
-         "--include-dashboard=false"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        [
+            *ray,
+            "--node-ip-address=127.0.0.1",
+            f"--ray-client-server-port={port}",
+            "--num-cpus=2",
+            "--include-dashboard=false",
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     try:
         address = f"--address=ray://127.0.0.1:{port}"
 

@@ -58,8 +58,10 @@ class Trainer:
 
     def collect(self, iteration: int) -> list:
         job = self.job
-        hypers = [hypers_of(job, p, self.done[p], iteration)._replace(**self.changed)
-                  for p in range(MEMBERS)]  # fmt: skip
+        hypers = [
+            hypers_of(job, p, self.done[p], iteration)._replace(**self.changed)
+            for p in range(MEMBERS)
+        ]
         limit = np.array([step_limit(job.config, c) for c in self.done])
         params = np.stack([np.asarray(state.params) for state in self.states])
         return [self.collector.collect(params, hypers, iteration, limit), hypers]
@@ -144,11 +146,26 @@ def test_python_calls_per_vector_step() -> None:
 # Seven of them are compiled loops, each for all members: none of the calls is made once per member.
 # Of the `lambda`s one samples continuous actions, one makes the `Step`; `reshape` gives views.
 PER_STEP = {
-    "_act": 1, "_clip": 1, "_advance": 1, "_run": 1, "_record": 1, "_all_finite": 1,
-    "_see_and_normalize": 1, "act": 1, "empty_like": 1, "<lambda>": 2, "step": 2, "evaluate": 1,
-    "_is_finite": 1, "_make_room": 1, "tolist": 1, "_told": 1, "__new__": 1, "see_and_normalize": 1,
+    "_act": 1,
+    "_clip": 1,
+    "_advance": 1,
+    "_run": 1,
+    "_record": 1,
+    "_all_finite": 1,
+    "_see_and_normalize": 1,
+    "act": 1,
+    "empty_like": 1,
+    "<lambda>": 2,
+    "step": 2,
+    "evaluate": 1,
+    "_is_finite": 1,
+    "_make_room": 1,
+    "tolist": 1,
+    "_told": 1,
+    "__new__": 1,
+    "see_and_normalize": 1,
     "reshape": 3,
-}  # fmt: skip
+}
 
 
 def test_memory_does_not_grow() -> None:

@@ -220,9 +220,17 @@ def test_the_learning_rate_falls_and_a_drop_rate_follows_its_list() -> None:
 @pytest.mark.slow
 def test_a_truncated_episode_bootstraps_and_a_wrong_one_would_not() -> None:
     """With a time limit every other step the value is still 1 / (1 - gamma) = 2."""
-    settings = {"rollout_steps": 64, "minibatches": 2, "epochs": 4, "steps": 64 * 120,
-                "gamma": 0.5, "learning_rate": 1e-2, "normalize_rewards": False,
-                "normalize_observations": False, "hidden": "8"}  # fmt: skip
+    settings = {
+        "rollout_steps": 64,
+        "minibatches": 2,
+        "epochs": 4,
+        "steps": 64 * 120,
+        "gamma": 0.5,
+        "learning_rate": 1e-2,
+        "normalize_rewards": False,
+        "normalize_observations": False,
+        "hidden": "8",
+    }
     found = {}
     for truncation in ("bootstrap", "terminate"):
         job = make_job("jax_worlds:cut_off", arm="ppo", truncation=truncation, **settings)

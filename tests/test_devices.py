@@ -19,15 +19,36 @@ from sauna.training import prepare
 from sauna.training.loop.device_program import make_mesh
 from sauna.training.loop.multihost import Place, read_place
 
-SETTINGS = ["jax_worlds:walk", "--arm", "sauna", "--threshold", "0.9", "--envs", "8",
-            "--rollout-steps", "32", "--minibatches", "4", "--epochs", "2", "--hidden", "8,8",
-            "--steps", "2000"]  # fmt: skip
+SETTINGS = [
+    "jax_worlds:walk",
+    "--arm",
+    "sauna",
+    "--threshold",
+    "0.9",
+    "--envs",
+    "8",
+    "--rollout-steps",
+    "32",
+    "--minibatches",
+    "4",
+    "--epochs",
+    "2",
+    "--hidden",
+    "8,8",
+    "--steps",
+    "2000",
+]
 
 
 def start(out: Path, *more: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "sauna", "train", *SETTINGS, "--out", str(out), *more]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                            cwd=Path(__file__).parent)  # fmt: skip
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=Path(__file__).parent,
+    )
 
 
 def free_address() -> str:
@@ -93,15 +114,30 @@ def test_only_machine_0_writes_a_run(tmp_path: Path) -> None:
 
 def test_devices_that_would_be_idle_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"3 members of 4 environments .* evenly over 5 devices"):
-        sauna.train("jax_worlds:walk", seeds=3, envs=4, devices=5, device="cpu", quiet=True,
-                    out=tmp_path / "run")  # fmt: skip
+        sauna.train(
+            "jax_worlds:walk",
+            seeds=3,
+            envs=4,
+            devices=5,
+            device="cpu",
+            quiet=True,
+            out=tmp_path / "run",
+        )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_one_program_is_not_shared_over_processes(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"processes: 3 asked for, but .* one program"):
-        sauna.train("jax_worlds:walk", seeds=4, envs=4, devices=2, device="cpu", processes=3,
-                    quiet=True, out=tmp_path / "run")  # fmt: skip
+        sauna.train(
+            "jax_worlds:walk",
+            seeds=4,
+            envs=4,
+            devices=2,
+            device="cpu",
+            processes=3,
+            quiet=True,
+            out=tmp_path / "run",
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -116,10 +152,15 @@ def test_a_run_on_the_device_is_never_resumed_inexactly(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "variables, usable",
-    [({}, True), ({"CUDA_VISIBLE_DEVICES": "1"}, True), ({"CUDA_VISIBLE_DEVICES": ""}, False),
-     ({"CUDA_VISIBLE_DEVICES": "-1"}, False), ({"JAX_PLATFORMS": "cpu"}, False),
-     ({"JAX_PLATFORMS": "cuda,cpu"}, True)],
-)  # fmt: skip
+    [
+        ({}, True),
+        ({"CUDA_VISIBLE_DEVICES": "1"}, True),
+        ({"CUDA_VISIBLE_DEVICES": ""}, False),
+        ({"CUDA_VISIBLE_DEVICES": "-1"}, False),
+        ({"JAX_PLATFORMS": "cpu"}, False),
+        ({"JAX_PLATFORMS": "cuda,cpu"}, True),
+    ],
+)
 def test_a_gpu_that_is_hidden_is_not_used(
     variables: dict[str, str], usable: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,9 +175,15 @@ def test_a_gpu_that_is_hidden_is_not_used(
 
 @pytest.mark.parametrize(
     "members, envs, devices, shape",
-    [(1, 8, 1, None), (4, 3, 2, (2, 1)), (1, 8, 4, (1, 4)), (2, 8, 8, (2, 4)), (3, 5, 2, None),
-     (6, 4, 8, (2, 4))],
-)  # fmt: skip
+    [
+        (1, 8, 1, None),
+        (4, 3, 2, (2, 1)),
+        (1, 8, 4, (1, 4)),
+        (2, 8, 8, (2, 4)),
+        (3, 5, 2, None),
+        (6, 4, 8, (2, 4)),
+    ],
+)
 def test_a_mesh_takes_as_many_devices_as_divide_the_work(
     members: int, envs: int, devices: int, shape: tuple[int, int] | None
 ) -> None:

@@ -45,10 +45,16 @@ def cell(label: str, values: list[float], **settings: Any) -> dict[str, Any]:
     own = {"task": "A-v0", "label": label, "arm": "sauna", "rates_of": None, "seeds": len(values)}
     own |= {key: settings.pop(key) for key in list(settings) if key in own}
     members = [
-        {"seed": seed, "keep_rate": 0.5, "final_return": -x, "entropy": x, "threshold": 0.9,
-         "points": [{"point": 1.0, "coverage": x}]}
+        {
+            "seed": seed,
+            "keep_rate": 0.5,
+            "final_return": -x,
+            "entropy": x,
+            "threshold": 0.9,
+            "points": [{"point": 1.0, "coverage": x}],
+        }
         for seed, x in enumerate(values)
-    ]  # fmt: skip
+    ]
     return {**own, "config": {**config, **settings}, "members": members}
 
 
@@ -74,11 +80,14 @@ def test_a_dial_is_found_where_there_is_one_and_only_there() -> None:
 def test_an_arm_is_told_apart_from_its_coin_pair_by_pair() -> None:
     """Entropy and coverage of the coins lie 0.2 below, seed by seed; or not at all."""
     for gaps, said in (
-        ([0.2, 0.2, 0.2], "told apart by entropy and coverage and return (threshold minus coin: "
-         "entropy 0.20 [0.20, 0.20], coverage 0.20 [0.20, 0.20], return -0.20 [-0.20, -0.20]; "
-         "3 pairs)."),
+        (
+            [0.2, 0.2, 0.2],
+            "told apart by entropy and coverage and return (threshold minus coin: "
+            "entropy 0.20 [0.20, 0.20], coverage 0.20 [0.20, 0.20], return -0.20 [-0.20, -0.20]; "
+            "3 pairs).",
+        ),
         ([0.2, -0.3, 0.1], "are not told apart (threshold minus coin: entropy 0.0"),
-    ):  # fmt: skip
+    ):
         values = [x - gap for x, gap in zip([0.5, 0.6, 0.4], gaps, strict=True)]
         coin = cell("coin", values, arm="random-drop", rates_of="0.5")
         told = verdicts(study(*RISING, coin))
@@ -118,14 +127,22 @@ def test_every_arm_stands_at_its_threshold() -> None:
     ]
     found = {mark.label: mark for mark in marks(study(*RISING, *others), "A-v0")}
     assert {label: mark.threshold for label, mark in found.items()} == {
-        "0.0": 0.0, "0.5": 0.5, "1.0": 1.0, "0 to 1": 0.9, "keeps half": 0.9, "coin": 0.5,
+        "0.0": 0.0,
+        "0.5": 0.5,
+        "1.0": 1.0,
+        "0 to 1": 0.9,
+        "keeps half": 0.9,
+        "coin": 0.5,
         "moved coin": 0.9,
-    }  # fmt: skip
+    }
     assert [found[x].kind for x in ("0 to 1", "keeps half")] == ["scheduled", "held keep rate"]
     page = extra(study(*RISING, *others))
     assert [plot.name for plot in page.plots] == [
-        "dial_keep_rate", "dial_entropy", "dial_coverage", "dial_final_return",
-    ]  # fmt: skip
+        "dial_keep_rate",
+        "dial_entropy",
+        "dial_coverage",
+        "dial_final_return",
+    ]
     assert len(page.plots[1].panels[0].lines) == 4
     assert len(text_table(study(*RISING, *others))) == 8
 
@@ -147,13 +164,21 @@ def test_the_scale_is_the_baselines_first_seed_or_none() -> None:
         return Item("A-v0", "sauna", "sauna", seed, Path("run"), [0.5, 1.0], [3, 7], [])
 
     assert scale_of(spec, [item(2), item(4)], "A-v0") == {
-        "run": "run", "member": "sauna/4", "iteration": 7}  # fmt: skip
+        "run": "run",
+        "member": "sauna/4",
+        "iteration": 7,
+    }
     assert scale_of(spec, [item(2)], "A-v0") is None
 
 
 def test_the_scale_needs_a_normaliser() -> None:
-    spec = {"tasks": ["A-v0"], "arms": [{"label": "sauna"}], "measure": "dial",
-            "checkpoint_every": 10, "keep_checkpoints": 1000}  # fmt: skip
+    spec = {
+        "tasks": ["A-v0"],
+        "arms": [{"label": "sauna"}],
+        "measure": "dial",
+        "checkpoint_every": 10,
+        "keep_checkpoints": 1000,
+    }
     assert read_spec(spec).measure == "dial"
     with pytest.raises(BadInput, match="normalize_observations: dial"):
         read_spec({**spec, "normalize_observations": False})
@@ -177,8 +202,15 @@ def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> 
     if name == "dial":  # an arm of every kind
         kinds = ("0", "0.8", "1.5", "0 to 1", "keeps 1 in 2", "coin like 0.8")
         text["arms"] = [arm for arm in text["arms"] if arm["label"] in kinds]
-    text |= {"seeds": 1, "steps": 8192, "rollout_steps": 512, "minibatches": 16, "hidden": [8, 8],
-             "epochs": 2, "checkpoint_every": 1}  # fmt: skip
+    text |= {
+        "seeds": 1,
+        "steps": 8192,
+        "rollout_steps": 512,
+        "minibatches": 16,
+        "hidden": [8, 8],
+        "epochs": 2,
+        "checkpoint_every": 1,
+    }
     lines = []
     for key, value in text.items():
         if key != "arms":
@@ -189,8 +221,9 @@ def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> 
     command = [sys.executable, "-m", "sauna", "study", "small.toml"]
 
     def run() -> str:
-        done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True,
-                              text=True)  # fmt: skip
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment(), capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 

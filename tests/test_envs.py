@@ -59,8 +59,10 @@ def test_steps_are_the_environments_own(make: Make) -> None:
         for i, env in enumerate(plain):
             observation, reward, terminated, truncated, _ = env.step(np.clip(row[i], -1, 1))
             assert (got.reward[i], got.terminated[i], got.truncated[i]) == (
-                reward, terminated, truncated,
-            )  # fmt: skip
+                reward,
+                terminated,
+                truncated,
+            )
             if terminated or truncated:
                 seen["terminated" if terminated else "truncated"] += 1
                 np.testing.assert_array_equal(got.final_observation[i], observation)
@@ -102,8 +104,18 @@ def test_a_restored_environment_goes_on_bit_for_bit(make: Make) -> None:
     again.close()
 
 
-@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Hopper-v5", "Ant-v5", "Humanoid-v5",
-                                  "InvertedPendulum-v5", "Reacher-v5", "Swimmer-v5"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "HalfCheetah-v5",
+        "Hopper-v5",
+        "Ant-v5",
+        "Humanoid-v5",
+        "InvertedPendulum-v5",
+        "Reacher-v5",
+        "Swimmer-v5",
+    ],
+)
 def test_mujoco_tasks_are_restored_bit_for_bit(name: str) -> None:
     seeds = [(0, 0)]
     envs, again = in_process(name, {}, seeds), in_process(name, {}, seeds)
@@ -152,8 +164,9 @@ def test_conversions_by_hand() -> None:
     assert action_writer(Spaced("box", "discrete").action_space)(np.array([0])) == -1
     read = observation_reader(gymnasium.spaces.Box(0, 255, (2, 40, 50), np.uint8))
     assert read(np.zeros((2, 40, 50), np.uint8)).shape == (40, 50, 2)
-    kind, shape = describe(gymnasium.spaces.Box(0, 255, (96, 96, 3), np.uint8),
-                           gymnasium.spaces.Discrete(2))[:2]  # fmt: skip
+    kind, shape = describe(
+        gymnasium.spaces.Box(0, 255, (96, 96, 3), np.uint8), gymnasium.spaces.Discrete(2)
+    )[:2]
     assert (kind, shape) == ("image", (96, 96, 3))
 
 

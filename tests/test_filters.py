@@ -83,8 +83,11 @@ def test_equals_plain_python(make, loop, history: str, threshold: float) -> None
 def test_the_four_sauna_rules_differ() -> None:
     """A negative control for the test above: no two of the loops are the same rule."""
     vex = np.random.default_rng(3).normal(0.6, 0.7, (60, 3)).astype(np.float32)
-    masks = [loop(vex, 0.8, kept).tobytes() for loop in (loop_per_env, loop_joint)
-             for kept in (False, True)]  # fmt: skip
+    masks = [
+        loop(vex, 0.8, kept).tobytes()
+        for loop in (loop_per_env, loop_joint)
+        for kept in (False, True)
+    ]
     assert len(set(masks)) == 4
 
 

@@ -15,8 +15,15 @@ from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.physics import load_model
 from sauna.envs.flagrun.task import Robot, Task
 
-GEAR = {"abdomen": 100, "hip_x": 100, "hip_z": 100, "hip_y": 300, "knee": 200, "shoulder": 75,
-        "elbow": 75}  # fmt: skip
+GEAR = {
+    "abdomen": 100,
+    "hip_x": 100,
+    "hip_z": 100,
+    "hip_y": 300,
+    "knee": 200,
+    "shoulder": 75,
+    "elbow": 75,
+}
 NO_DRAWS = np.full(rules.STEP_DRAWS, 0.5)
 IDLE = np.zeros(17)
 
@@ -24,9 +31,13 @@ IDLE = np.zeros(17)
 def robot(x=0.0, y=0.0, z=1.2, yaw=0.0, velocity=(0.0, 0.0, 0.0), joints=0.0, speeds=0.0) -> Robot:
     quaternion = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
     return Robot(
-        np.array([x, y, z]), quaternion, np.array(velocity),
-        np.full(17, joints), np.full(17, speeds), np.zeros(2),
-    )  # fmt: skip
+        np.array([x, y, z]),
+        quaternion,
+        np.array(velocity),
+        np.full(17, joints),
+        np.full(17, speeds),
+        np.zeros(2),
+    )
 
 
 def begun(at: Robot, flag=(5.0, 0.0), **changes: object) -> Task:
@@ -42,10 +53,16 @@ def test_the_model_has_roboschools_motors_and_cube() -> None:
     assert model.nu == rules.JOINTS == 17
     assert rules.SUBSTEPS * model.opt.timestep == pytest.approx(0.0165) == rules.CONTROL_DT
     names = [model.actuator(i).name for i in range(17)]
-    legs = [f"{side}_{part}" for side in ("right", "left")
-            for part in ("hip_x", "hip_z", "hip_y", "knee")]  # fmt: skip
-    arms = [f"{side}_{part}" for side in ("right", "left")
-            for part in ("shoulder1", "shoulder2", "elbow")]  # fmt: skip
+    legs = [
+        f"{side}_{part}"
+        for side in ("right", "left")
+        for part in ("hip_x", "hip_z", "hip_y", "knee")
+    ]
+    arms = [
+        f"{side}_{part}"
+        for side in ("right", "left")
+        for part in ("shoulder1", "shoulder2", "elbow")
+    ]
     assert names == ["abdomen_z", "abdomen_y", "abdomen_x", *legs, *arms]
     for i, name in enumerate(names):
         strength = next(v for part, v in GEAR.items() if part in name)
@@ -174,8 +191,9 @@ def test_crawling_pays_nothing_and_walking_does() -> None:
     assert advance(task, robot(1.0, z=0.4)).reward.progress == 0.0
     up = advance(advance(task, robot(1.0, z=0.4)).task, robot(1.0, z=0.8))
     assert up.reward.progress == pytest.approx(50.0)  # for standing up, not for the metre
-    assert advance(begun(lying._replace(position=np.array([0, 0, 0.8]))), robot(1.0, z=0.8)) \
-        .reward.progress == pytest.approx(1 / 0.0165)  # fmt: skip
+    assert advance(
+        begun(lying._replace(position=np.array([0, 0, 0.8]))), robot(1.0, z=0.8)
+    ).reward.progress == pytest.approx(1 / 0.0165)
 
 
 @pytest.mark.parametrize("z", [1.2, 0.4])

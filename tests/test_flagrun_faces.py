@@ -287,8 +287,10 @@ def test_a_step_on_the_device_is_the_hosts() -> None:
                 rewards.append(abs(reward - float(after.reward[i])))
         state = after.state
     assert len(apart) > 1000 and thrown
-    print(f"observations apart: {np.quantile(apart, [0.5, 0.9, 0.99, 1.0])}, "
-          f"rewards: {np.quantile(rewards, [0.5, 0.9, 0.99, 1.0])}")  # fmt: skip
+    print(
+        f"observations apart: {np.quantile(apart, [0.5, 0.9, 0.99, 1.0])}, "
+        f"rewards: {np.quantile(rewards, [0.5, 0.9, 0.99, 1.0])}"
+    )
     assert np.quantile(apart, 0.5) < 1e-4 and np.quantile(apart, 0.9) < 3e-2
     assert np.quantile(rewards, 0.5) < 5e-3 and np.quantile(rewards, 0.9) < 5e-2
     shapes = jax.tree.map(lambda a, b: (a.shape, a.dtype) == (b.shape, b.dtype), state, after.state)

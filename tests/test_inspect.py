@@ -48,8 +48,13 @@ THRESHOLD = 0.9
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`ppo/0` and `sauna/0`, trained a little, in an environment that can be drawn."""
     path = tmp_path_factory.mktemp("inspect") / "run"
-    settings = {**SMALL, "arm": "ppo,sauna", "threshold": THRESHOLD, "rollout_steps": 16,
-                "processes": 1}  # fmt: skip
+    settings = {
+        **SMALL,
+        "arm": "ppo,sauna",
+        "threshold": THRESHOLD,
+        "rollout_steps": 16,
+        "processes": 1,
+    }
     return sauna.train("worlds:Drawn", quiet=True, out=path, **settings).path
 
 
@@ -92,8 +97,11 @@ def by_hand(config: Config, vex: np.ndarray) -> tuple[list[float], list[bool], l
 def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) -> None:
     config = dataclasses.replace(
         configured(arm="sauna", threshold=THRESHOLD, rollout_steps=16, minibatches=1),
-        envs=envs, history=history, decision=decision, dropped=dropped,
-    )  # fmt: skip
+        envs=envs,
+        history=history,
+        decision=decision,
+        dropped=dropped,
+    )
     vex = np.random.default_rng(0).normal(size=(70, envs)).astype(np.float32)
     nothing = np.zeros((70, envs, 1), np.float32)
     made = decide(config, nothing, vex, jax.random.key(0), hypers_of(config))
@@ -218,12 +226,18 @@ def test_advantages_over_kept_steps_are_the_updates() -> None:
     config = configured(arm="sauna-reference", rollout_steps=24, minibatches=1)
     keep = np.zeros((length, 1), bool)
     keep[random.permutation(39)[:23]] = keep[39] = True
-    columns = {name: random.normal(size=(length, 1)).astype(np.float32)
-               for name in ("reward", "value", "next_value")}  # fmt: skip
+    columns = {
+        name: random.normal(size=(length, 1)).astype(np.float32)
+        for name in ("reward", "value", "next_value")
+    }
     ended = random.random((length, 1)) < 0.2
     zeros = np.zeros((length, 1), np.float32)
-    columns |= {"terminated": ended, "truncated": ~ended & (zeros > 0), "keep": keep,
-                "valid": np.ones((length, 1), bool)}  # fmt: skip
+    columns |= {
+        "terminated": ended,
+        "truncated": ~ended & (zeros > 0),
+        "keep": keep,
+        "valid": np.ones((length, 1), bool),
+    }
     stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields))
     hypers = hypers_of(config)
     update = jax.jit(partial(make_batch, config=config, target=make_target(config)))
@@ -302,8 +316,13 @@ def test_what_cannot_be_drawn_is_said_in_one_line(run, monkeypatch, how) -> None
 
 def test_bad_input_creates_nothing(run, tmp_path) -> None:
     before = sorted(run.rglob("*"))
-    for settings in ({"member": "sauna/9"}, {"episodes": 0}, {"seed": -1},
-                     {"out": tmp_path}, {"out": tmp_path / "none" / "page.html"}):  # fmt: skip
+    for settings in (
+        {"member": "sauna/9"},
+        {"episodes": 0},
+        {"seed": -1},
+        {"out": tmp_path},
+        {"out": tmp_path / "none" / "page.html"},
+    ):
         with pytest.raises(BadInput):
             sauna.inspect(run, **settings)
     assert sorted(run.rglob("*")) == before and not [*tmp_path.iterdir()]
@@ -358,11 +377,15 @@ def data_of(page: Path) -> dict[str, Any]:
 def test_the_pages_numbers_are_the_arrays(page, found) -> None:
     data = data_of(page)
     arrays = {
-        "vex": found.decisions.prediction, "median": found.decisions.median,
-        "edge": THRESHOLD * np.abs(found.decisions.median), "value": found.value,
-        "return": found.value + found.advantage, "advantage": found.advantage,
-        "reward": found.reward, "raw_reward": found.played.reward,
-    }  # fmt: skip
+        "vex": found.decisions.prediction,
+        "median": found.decisions.median,
+        "edge": THRESHOLD * np.abs(found.decisions.median),
+        "value": found.value,
+        "return": found.value + found.advantage,
+        "advantage": found.advantage,
+        "reward": found.reward,
+        "raw_reward": found.played.reward,
+    }
     assert data["series"].keys() == arrays.keys()
     for name, values in arrays.items():
         shown = np.array(data["series"][name], float)
@@ -385,7 +408,10 @@ def test_without_a_head_the_page_says_so(run, browser, tmp_path) -> None:
     assert "vex" not in data_of(path)["series"]
     browser.open(path, width=1280)
     assert browser.run("[...document.querySelectorAll('.track')].map(t => t.dataset.name)") == [
-        "value", "advantage", "reward"]  # fmt: skip
+        "value",
+        "advantage",
+        "reward",
+    ]
     assert not browser.complaints()
 
 
@@ -418,12 +444,24 @@ def test_picture_line_and_numbers_are_of_one_step(browser, page, found) -> None:
     browser.run("scrollTo(0, 0)")
     x, y, width, height = browser.run(f"{place}.getBoundingClientRect())")
     for kind in ("mousePressed", "mouseReleased"):
-        browser.send("Input.dispatchMouseEvent", type=kind, x=x + width - 9, y=y + height / 2,
-                     button="left", buttons=1, clickCount=1)  # fmt: skip
+        browser.send(
+            "Input.dispatchMouseEvent",
+            type=kind,
+            x=x + width - 9,
+            y=y + height / 2,
+            button="left",
+            buttons=1,
+            clickCount=1,
+        )
     assert shown(browser)["slider"] == str(last)
     for kind in ("keyDown", "keyUp"):
-        browser.send("Input.dispatchKeyEvent", type=kind, key="ArrowLeft", code="ArrowLeft",
-                     windowsVirtualKeyCode=37)  # fmt: skip
+        browser.send(
+            "Input.dispatchKeyEvent",
+            type=kind,
+            key="ArrowLeft",
+            code="ArrowLeft",
+            windowsVirtualKeyCode=37,
+        )
     assert shown(browser)["slider"] == str(last - 1)
     assert not browser.complaints()
 

@@ -161,8 +161,16 @@ def test_unknown_names_and_arguments_are_bad_input() -> None:
         make_jax_env("jax_worlds:walk", {"limit": 3})
 
 
-CARTPOLE = {"envs": 8, "rollout_steps": 128, "minibatches": 4, "epochs": 8, "hidden": "64,64",
-            "learning_rate": 1e-3, "steps": 200_000, "seeds": 10}  # fmt: skip
+CARTPOLE = {
+    "envs": 8,
+    "rollout_steps": 128,
+    "minibatches": 4,
+    "epochs": 8,
+    "hidden": "64,64",
+    "learning_rate": 1e-3,
+    "steps": 200_000,
+    "seeds": 10,
+}
 
 
 class UntilSolved(Recorder):
@@ -194,10 +202,33 @@ def test_ten_members_solve_cartpole(arm: str) -> None:
 def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path) -> None:
     """As a user would; XLA is told not to optimise, which would take longer than the training."""
     run = tmp_path / "run"
-    command = [sys.executable, "-m", "sauna", "train", env, "--threshold", "0.9", "--envs", "4",
-               "--rollout-steps", "8", "--minibatches", "2", "--hidden", "8", "--steps", "128",
-               "--epochs", "2",
-               "--reset", "cached", "--backend", "device", "--out", str(run)]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "sauna",
+        "train",
+        env,
+        "--threshold",
+        "0.9",
+        "--envs",
+        "4",
+        "--rollout-steps",
+        "8",
+        "--minibatches",
+        "2",
+        "--hidden",
+        "8",
+        "--steps",
+        "128",
+        "--epochs",
+        "2",
+        "--reset",
+        "cached",
+        "--backend",
+        "device",
+        "--out",
+        str(run),
+    ]
     fast = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
     variables = {**os.environ, "XLA_FLAGS": fast}
     done = subprocess.run(command, env=variables, capture_output=True, text=True)

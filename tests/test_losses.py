@@ -21,10 +21,17 @@ VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 
 def hypers(**values: float) -> Hypers:
     start = {
-        "learning_rate": 0.01, "clip_range": 0.2, "gamma": 0.9, "gae_lambda": 0.8,
-        "entropy_coef": 0.01, "value_coef": 0.5, "vex_coef": 0.3, "max_grad_norm": 0.5,
-        "threshold": 0.3, "drop_rate": 0.0,
-    }  # fmt: skip
+        "learning_rate": 0.01,
+        "clip_range": 0.2,
+        "gamma": 0.9,
+        "gae_lambda": 0.8,
+        "entropy_coef": 0.01,
+        "value_coef": 0.5,
+        "vex_coef": 0.3,
+        "max_grad_norm": 0.5,
+        "threshold": 0.3,
+        "drop_rate": 0.0,
+    }
     return Hypers(**{k: np.float64(v) for k, v in {**start, **values}.items()})
 
 

@@ -41,9 +41,14 @@ def test_these_are_the_eleven_tasks() -> None:
     assert len(NAMES) == len(TASKS) == 11
 
 
-@pytest.mark.parametrize("name, kwargs", [
-    pytest.param(name, {}, marks=[pytest.mark.slow] * name.startswith("Humanoid")) for name in NAMES
-] + KWARGS)  # fmt: skip
+@pytest.mark.parametrize(
+    "name, kwargs",
+    [
+        pytest.param(name, {}, marks=[pytest.mark.slow] * name.startswith("Humanoid"))
+        for name in NAMES
+    ]
+    + KWARGS,
+)
 def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
     """Every task to its time limit, or through tens of falls; some rows stand still for a while."""
     fast = in_process_envs(name, kwargs, SEEDS, "auto")

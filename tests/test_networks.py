@@ -125,8 +125,10 @@ def test_nature_cnn_takes_bytes() -> None:
     np.testing.assert_allclose(output.value, scaled.value, atol=1e-5)
     params = policy.unravel(flat)["params"]["trunk"]
     assert [params[f"conv_{i}"]["kernel"].shape for i in range(3)] == [
-        (8, 8, 2, 32), (4, 4, 32, 64), (3, 3, 64, 64),
-    ]  # fmt: skip
+        (8, 8, 2, 32),
+        (4, 4, 32, 64),
+        (3, 3, 64, 64),
+    ]
 
 
 def test_the_nature_cnn_by_hand() -> None:
@@ -136,20 +138,25 @@ def test_the_nature_cnn_by_hand() -> None:
         lambda x: NatureCNN().init_with_output(jax.random.key(0), x), picture
     )
     assert features.shape == (2, 512)
-    sizes = {name: sum(math.prod(p.shape) for p in jax.tree.leaves(layer))
-             for name, layer in params["params"].items()}  # fmt: skip
+    sizes = {
+        name: sum(math.prod(p.shape) for p in jax.tree.leaves(layer))
+        for name, layer in params["params"].items()
+    }
     assert sizes == {
-        "conv_0": 8 * 8 * 4 * 32 + 32, "conv_1": 4 * 4 * 32 * 64 + 64,
-        "conv_2": 3 * 3 * 64 * 64 + 64, "dense": 3136 * 512 + 512,
-    }  # fmt: skip
+        "conv_0": 8 * 8 * 4 * 32 + 32,
+        "conv_1": 4 * 4 * 32 * 64 + 64,
+        "conv_2": 3 * 3 * 64 * 64 + 64,
+        "dense": 3136 * 512 + 512,
+    }
     assert sum(sizes.values()) == 1_684_128
 
 
 def theirs(layers, x):
     """`convolutions` with XLA's own."""
     for (kernel, bias), (_, _, stride) in zip(layers, LAYERS, strict=True):
-        x = jax.lax.conv_general_dilated(x, kernel, (stride,) * 2, "VALID",
-                                         dimension_numbers=("NHWC", "HWIO", "NHWC"))  # fmt: skip
+        x = jax.lax.conv_general_dilated(
+            x, kernel, (stride,) * 2, "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
         x = jax.nn.relu(x + bias)
     return x
 
@@ -216,8 +223,16 @@ def test_something_else_than_a_module_is_refused() -> None:
 
 
 def test_images_train_end_to_end() -> None:
-    job = make_job("worlds:Picture", arm="vex-head", network="nature-cnn", rollout_steps=8,
-                   minibatches=2, epochs=1, steps=16, trunk="shared")  # fmt: skip
+    job = make_job(
+        "worlds:Picture",
+        arm="vex-head",
+        network="nature-cnn",
+        rollout_steps=8,
+        minibatches=2,
+        epochs=1,
+        steps=16,
+        trunk="shared",
+    )
     assert not job.config.normalize_observations
     recorder = train_here(job)
     assert recorder.final["vex-head/0/collect/observation"].dtype == np.uint8

@@ -55,9 +55,14 @@ def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
             ).total
 
         got = policy_gradient(
-            params, batch.observation, batch.action, batch.advantage, batch.weight,
-            policy=policy, standardized=True,
-        )  # fmt: skip
+            params,
+            batch.observation,
+            batch.action,
+            batch.advantage,
+            batch.weight,
+            policy=policy,
+            standardized=True,
+        )
         np.testing.assert_allclose(got, -jax.grad(loss)(params), atol=1e-12)
         assert np.abs(got).max() > 1e-3
 
@@ -70,9 +75,14 @@ def test_the_gradient_by_hand_where_it_is_simple() -> None:
     mean, log_std = np.split(np.asarray(policy.apply(params, observation).policy), 2, -1)
     z, a, w = (action - mean) / np.exp(log_std), batch.advantage[:, None], batch.weight[:, None]
     gradient = policy_gradient(
-        params, observation, action, batch.advantage.astype(np.float32), w[:, 0], policy=policy,
+        params,
+        observation,
+        action,
+        batch.advantage.astype(np.float32),
+        w[:, 0],
+        policy=policy,
         standardized=False,
-    )  # fmt: skip
+    )
     got = policy.unravel(gradient)["params"]
     np.testing.assert_allclose(got["log_std"], (w * a * (z**2 - 1)).sum(0) / w.sum(), rtol=1e-4)
     bias = (w * a * z / np.exp(log_std)).sum(0) / w.sum()
@@ -109,8 +119,12 @@ def test_estimates_are_unbiased_and_intervals_hold_the_truth(few_resamples: None
     spread = np.array([1.0, 0.5])
     signal = (means**2).sum(1)
     variance = size * (spread**2 + 0.25)  # of a minibatch: its own noise and its stream's
-    truth = {"signal": signal, "variance": variance, "snr": signal / variance,
-             "snr_per_env_step": signal / variance}  # fmt: skip
+    truth = {
+        "signal": signal,
+        "variance": variance,
+        "snr": signal / variance,
+        "snr_per_env_step": signal / variance,
+    }
     cosine = means[0] @ means[1] / np.sqrt(signal.prod())
     values: dict[str, list[np.ndarray]] = {name: [] for name in [*truth, "alignment"]}
     held: dict[str, list[bool]] = {name: [] for name in [*truth, "alignment"]}
@@ -149,10 +163,21 @@ def test_a_coin_finds_no_difference_and_a_real_one_is_found(few_resamples: None)
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run of two members that drop much."""
     return train(
-        "InvertedPendulum-v5", arm="sauna", threshold=0.95, seeds=2, steps=2048, rollout_steps=256,
-        minibatches=16, hidden=[8, 8], epochs=2, processes=1, checkpoint_every=2,
-        keep_checkpoints=99, out=tmp_path_factory.mktemp("noise") / "run", quiet=True,
-    ).path  # fmt: skip
+        "InvertedPendulum-v5",
+        arm="sauna",
+        threshold=0.95,
+        seeds=2,
+        steps=2048,
+        rollout_steps=256,
+        minibatches=16,
+        hidden=[8, 8],
+        epochs=2,
+        processes=1,
+        checkpoint_every=2,
+        keep_checkpoints=99,
+        out=tmp_path_factory.mktemp("noise") / "run",
+        quiet=True,
+    ).path
 
 
 @pytest.fixture(scope="module")
@@ -174,8 +199,9 @@ def test_streams_are_the_members_next_rollouts(run: Path, standing: Standing, st
     again = fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2).streams
     for one, other in zip(streams, again, strict=True):
         assert all(np.array_equal(x, y) for x, y in zip(one, other, strict=True))
-    moments = Moments(*(standing.arrays[f"observation_moments/{name}"]
-                        for name in ("mean", "variance", "count")))  # fmt: skip
+    moments = Moments(
+        *(standing.arrays[f"observation_moments/{name}"] for name in ("mean", "variance", "count"))
+    )
     for stream in streams:
         kept, steps = int(stream.keep.sum()), len(stream.keep)
         assert kept == 2 * 256 or steps == 2 * 4 * 256  # two rollouts, full or at their bound
@@ -256,8 +282,12 @@ def point(at: float, snr: float, coin: float = 0.010, raw: float = 1.0) -> dict[
         }
         for name, x in (("kept", 0.02), ("dropped", snr), ("coin", coin), ("shifted", coin))
     }
-    difference = {"snr": [snr - coin, 0, 0], "cosine": [snr - coin, 0, 0],
-                  "snr_per_env_step": [0.001, 0, 0], "variance_ratio": [1.2, 1, 2]}  # fmt: skip
+    difference = {
+        "snr": [snr - coin, 0, 0],
+        "cosine": [snr - coin, 0, 0],
+        "snr_per_env_step": [0.001, 0, 0],
+        "variance_ratio": [1.2, 1, 2],
+    }
     pairs = ("dropped - coin", "kept - coin", "dropped - shifted")
     rules = {
         "standardized": {"groups": groups, "differences": dict.fromkeys(pairs, difference)},
@@ -266,14 +296,25 @@ def point(at: float, snr: float, coin: float = 0.010, raw: float = 1.0) -> dict[
             "differences": {key: {"variance_ratio": [raw, 0, 9]} for key in pairs},
         },
     }
-    return {"point": at, "keep_rate": 0.7, "minibatch": 64, "as_trained": "standardized",
-            "rules": rules}  # fmt: skip
+    return {
+        "point": at,
+        "keep_rate": 0.7,
+        "minibatch": 64,
+        "as_trained": "standardized",
+        "rules": rules,
+    }
 
 
 def measured(*members: list[dict[str, Any]]) -> dict[str, Any]:
     listed = [{"seed": seed, "points": points} for seed, points in enumerate(members)]
-    cell = {"task": "A-v0", "label": "sauna", "arm": "sauna", "steps": 1000, "members": listed,
-            "seeds": len(listed)}  # fmt: skip
+    cell = {
+        "task": "A-v0",
+        "label": "sauna",
+        "arm": "sauna",
+        "steps": 1000,
+        "members": listed,
+        "seeds": len(listed),
+    }
     return {"name": "noise", "measure": "noise", "cells": [cell]}
 
 
@@ -336,8 +377,12 @@ def test_where_nothing_was_dropped_nothing_is_said() -> None:
     assert extra(measured([empty])).plots == []
 
 
-SPEC = {"tasks": ["A-v0"], "arms": [{"label": "sauna"}], "checkpoint_every": 10,
-        "keep_checkpoints": 1000}  # fmt: skip
+SPEC = {
+    "tasks": ["A-v0"],
+    "arms": [{"label": "sauna"}],
+    "checkpoint_every": 10,
+    "keep_checkpoints": 1000,
+}
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,12 @@ from sauna.system import checkpoint
 from sauna.system.errors import BadInput
 
 WORLD = "worlds:Scripted"
-ARMS = [("ppo", {}), ("sauna-reference", {"threshold": 0.6}),
-        pytest.param("sauna", {"threshold": 0.9}, marks=pytest.mark.slow),
-        pytest.param("random-drop", {"drop_rate": 0.3}, marks=pytest.mark.slow)]  # fmt: skip
+ARMS = [
+    ("ppo", {}),
+    ("sauna-reference", {"threshold": 0.6}),
+    pytest.param("sauna", {"threshold": 0.9}, marks=pytest.mark.slow),
+    pytest.param("random-drop", {"drop_rate": 0.3}, marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.parametrize("arm, settings", ARMS)
@@ -27,9 +30,11 @@ def test_member_3_alone_among_six_and_in_another_process(arm, settings, tmp_path
     assert equal(own(alone.final, f"{arm}/3"), own(among.final, f"{arm}/3"))
     assert alone.rows == [row for row in among.rows if row["seed"] == 3]
     elsewhere = sauna.train(
-        WORLD, quiet=True, out=tmp_path / "run",
+        WORLD,
+        quiet=True,
+        out=tmp_path / "run",
         **{**SMALL, **common, "seeds": "3,4,5", "processes": 2},
-    )  # fmt: skip
+    )
     stored = checkpoint.load_newest(elsewhere.path / "checkpoints", print)
     assert stored is not None
     assert equal(own(alone.final, f"{arm}/3"), own(stored.arrays, f"{arm}/3"))
@@ -42,14 +47,19 @@ def test_members_differ() -> None:
     assert not np.array_equal(own(final, "ppo/0")["/adam/mean"], own(final, "ppo/1")["/adam/mean"])
 
 
-@pytest.mark.parametrize("target, trunk", [
-    ("rollout", "separate"), ("sample", "separate"), ("sample", "shared"),
-    pytest.param("minibatch", "separate", marks=pytest.mark.slow),
-    pytest.param("episode", "separate", marks=pytest.mark.slow),
-    pytest.param("rollout", "shared", marks=pytest.mark.slow),
-    pytest.param("minibatch", "shared", marks=pytest.mark.slow),
-    pytest.param("episode", "shared", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "target, trunk",
+    [
+        ("rollout", "separate"),
+        ("sample", "separate"),
+        ("sample", "shared"),
+        pytest.param("minibatch", "separate", marks=pytest.mark.slow),
+        pytest.param("episode", "separate", marks=pytest.mark.slow),
+        pytest.param("rollout", "shared", marks=pytest.mark.slow),
+        pytest.param("minibatch", "shared", marks=pytest.mark.slow),
+        pytest.param("episode", "shared", marks=pytest.mark.slow),
+    ],
+)
 def test_off_means_off(target: str, trunk: str) -> None:
     """Threshold 0 and c2 = 0 are PPO bit for bit, whatever the head would have learned."""
     common = {"envs": 2, "trunk": trunk, "steps": 256}
@@ -95,5 +105,8 @@ def test_unfiltered_arms_take_the_rules_of_the_filtered_one() -> None:
 def test_arms_of_other_programs_are_refused() -> None:
     for arms in ("sauna,random-drop", "sauna,sauna-reference", "sauna,sauna-paper"):
         with pytest.raises(BadInput, match="shapes the compiled program"):
-            resolve({"env": "x", "arm": arms, "drop_rate": 0.1} if "random" in arms
-                    else {"env": "x", "arm": arms})  # fmt: skip
+            resolve(
+                {"env": "x", "arm": arms, "drop_rate": 0.1}
+                if "random" in arms
+                else {"env": "x", "arm": arms}
+            )

@@ -18,11 +18,20 @@ GAMMA = 0.8
 def learn(world: str, arm: str, **settings: Any) -> Any:
     """Trains both seeds; a function from observations to each seed's network output."""
     given = {
-        "rollout_steps": 64, "minibatches": 4, "epochs": 8, "hidden": "16", "steps": 64 * 40,
-        "learning_rate": 0.02, "learning_rate_schedule": "linear", "seeds": SEEDS, "gamma": GAMMA,
-        "normalize_observations": False, "normalize_rewards": False, "clip_value": False,
+        "rollout_steps": 64,
+        "minibatches": 4,
+        "epochs": 8,
+        "hidden": "16",
+        "steps": 64 * 40,
+        "learning_rate": 0.02,
+        "learning_rate_schedule": "linear",
+        "seeds": SEEDS,
+        "gamma": GAMMA,
+        "normalize_observations": False,
+        "normalize_rewards": False,
+        "clip_value": False,
         **settings,
-    }  # fmt: skip
+    }
     job = make_job(f"worlds:{world}", arm=arm, **given)
     recorder = train_here(job)
 

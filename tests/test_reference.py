@@ -81,8 +81,9 @@ class Actors:
         return scaled, dones, np.array(cut), final, scores
 
 
-def released_runner(actors: Actors, act, value, threshold: float, gamma: float, lam: float,
-                    dones: np.ndarray, noise) -> dict:  # fmt: skip
+def released_runner(
+    actors: Actors, act, value, threshold: float, gamma: float, lam: float, dones: np.ndarray, noise
+) -> dict:
     obs, rewards, values, vexp, started, scores = [], [], [], [], [], []
     t = 0
     while len(obs) < T:
@@ -109,12 +110,20 @@ def released_runner(actors: Actors, act, value, threshold: float, gamma: float, 
         following = last if k == T - 1 else values[k + 1]
         delta = rewards[k] + gamma * following * alive - values[k]
         advantage[k] = later = delta + gamma * lam * alive * later
-    return {"obs": np.stack(obs), "advantage": advantage, "value": np.stack(values),
-            "steps": t, "dones": dones, "scores": scores, "reward": np.stack(rewards)}  # fmt: skip
+    return {
+        "obs": np.stack(obs),
+        "advantage": advantage,
+        "value": np.stack(values),
+        "steps": t,
+        "dones": dones,
+        "scores": scores,
+        "reward": np.stack(rewards),
+    }
 
 
-def corrected_runner(actors: Actors, act, value, threshold: float, gamma: float, lam: float,
-                     noise) -> dict:  # fmt: skip
+def corrected_runner(
+    actors: Actors, act, value, threshold: float, gamma: float, lam: float, noise
+) -> dict:
     """The corrected rules: per env, all earlier steps, full-stream GAE, final values."""
     kept: list[list[int]] = [[] for _ in range(N)]
     stream: list[dict] = []
@@ -150,8 +159,16 @@ class Setup:
     """One member of the real program and what the re-statements need of it."""
 
     def __init__(self, arm: str, **settings) -> None:
-        job = make_job("worlds:Scripted", arm=arm, seeds="3,", envs=N, rollout_steps=T,
-                       steps=10_000, minibatches=4, **settings)  # fmt: skip
+        job = make_job(
+            "worlds:Scripted",
+            arm=arm,
+            seeds="3,",
+            envs=N,
+            rollout_steps=T,
+            steps=10_000,
+            minibatches=4,
+            **settings,
+        )
         self.job, self.config = job, job.config
         self.program = make_program(job.config, job.spaces)
         self.keys = member_keys(3)
@@ -198,8 +215,9 @@ def test_reference_preset_equals_the_released_runner(threshold: float) -> None:
         assert collected.env_steps == expected["steps"] * N
         assert collected.kept_steps == T * N
         dropped += expected["steps"] - T
-        shaped = {k: np.asarray(v).reshape((T, N, *v.shape[1:])) for k, v in
-                  batch._asdict().items()}  # fmt: skip
+        shaped = {
+            k: np.asarray(v).reshape((T, N, *v.shape[1:])) for k, v in batch._asdict().items()
+        }
         np.testing.assert_allclose(shaped["observation"], expected["obs"], atol=1e-6)
         np.testing.assert_allclose(shaped["value"], expected["value"], atol=1e-6)
         np.testing.assert_allclose(shaped["advantage"], expected["advantage"], atol=1e-4)

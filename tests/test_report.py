@@ -32,10 +32,18 @@ def member(seed: int, level: float, keep_rate: float) -> dict[str, Any]:
     curve["vex_mean"] = [None] * 10 if keep_rate == 1 else [0.05 * i for i in range(10)]
     curve["explained_variance"] = [0.5 + 0.01 * seed] * 10
     return {
-        "seed": seed, "status": "complete", "error": None, "final_return": final,
-        "area": 0.6 * final, "env_steps": 100_000, "kept_steps": int(100_000 * keep_rate),
-        "keep_rate": keep_rate, "episodes": 99, "explained_variance": 0.5, "curve": curve,
-    }  # fmt: skip
+        "seed": seed,
+        "status": "complete",
+        "error": None,
+        "final_return": final,
+        "area": 0.6 * final,
+        "env_steps": 100_000,
+        "kept_steps": int(100_000 * keep_rate),
+        "keep_rate": keep_rate,
+        "episodes": 99,
+        "explained_variance": 0.5,
+        "curve": curve,
+    }
 
 
 def make_results(
@@ -47,21 +55,32 @@ def make_results(
         for place, label in enumerate(("ppo", "vex-head", "sauna", "sauna 0.8")):
             level = -7.4 if "Reacher" in task else 1500.5 + 300 * place
             members = [member(seed, level, 1 - 0.2 * (place > 1)) for seed in range(seeds)]
-            cells.append({
-                "task": task + mark, "label": label + mark, "arm": label.split()[0],
-                "preset": "mujoco", "members": members,
-                "config": {"steps": 100_000, "threshold": 0.1 * place, "note": mark},
-                "command": f"sauna train {task} --arm {label} {mark}",
-            })  # fmt: skip
+            cells.append(
+                {
+                    "task": task + mark,
+                    "label": label + mark,
+                    "arm": label.split()[0],
+                    "preset": "mujoco",
+                    "members": members,
+                    "config": {"steps": 100_000, "threshold": 0.1 * place, "note": mark},
+                    "command": f"sauna train {task} --arm {label} {mark}",
+                }
+            )
     if seeds > 1:
         failed = {"status": "failed", "error": ERROR + mark, "final_return": None, "area": None}
         cells[2]["members"][1].update(failed)
     return {
-        "format": 1, "name": "compare" + mark, "command": "sauna compare --seeds 5 " + mark,
-        "metric": "mean return of the last 100 episodes" + mark, "baseline": "ppo" + mark,
-        "settings": {"steps": 100_000, "note": mark}, "versions": {"sauna": "0.1.0"},
-        "machine": {"cores": 2}, "git": None, "cells": cells,
-    }  # fmt: skip
+        "format": 1,
+        "name": "compare" + mark,
+        "command": "sauna compare --seeds 5 " + mark,
+        "metric": "mean return of the last 100 episodes" + mark,
+        "baseline": "ppo" + mark,
+        "settings": {"steps": 100_000, "note": mark},
+        "versions": {"sauna": "0.1.0"},
+        "machine": {"cores": 2},
+        "git": None,
+        "cells": cells,
+    }
 
 
 class Page(HTMLParser):
@@ -132,9 +151,14 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
 def expected(row: dict[str, Any]) -> list[list[float]]:
     """The cells of a row of the main table, as `summary.json` has them."""
     cells = (
-        row["final_iqm"], row["improvement"] or [], row["area_iqm"],
-        [row["final_mean"], row["final_std"]], [row["keep_rate"]], [row["env_steps"]], [],
-    )  # fmt: skip
+        row["final_iqm"],
+        row["improvement"] or [],
+        row["area_iqm"],
+        [row["final_mean"], row["final_std"]],
+        [row["keep_rate"]],
+        [row["env_steps"]],
+        [],
+    )
     return [[value for value in cell if value is not None] for cell in cells]
 
 
@@ -344,8 +368,13 @@ def test_values_follow_keyboard_and_pointer(browser, report) -> None:
     assert f"{final:,.0f}" in at_end
     browser.run("document.querySelector('#learning_curves input').focus()")
     for kind in ("keyDown", "keyUp"):
-        browser.send("Input.dispatchKeyEvent", type=kind, key="ArrowLeft", code="ArrowLeft",
-                     windowsVirtualKeyCode=37)  # fmt: skip
+        browser.send(
+            "Input.dispatchKeyEvent",
+            type=kind,
+            key="ArrowLeft",
+            code="ArrowLeft",
+            windowsVirtualKeyCode=37,
+        )
     assert browser.run(readout) != at_end
     said = "document.querySelector('#learning_curves input').getAttribute('aria-valuetext')"
     assert "90k env steps: ppo " in browser.run(said)

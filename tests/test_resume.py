@@ -55,8 +55,15 @@ def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, c
 
 def test_a_run_of_such_an_environment_goes_on_with_new_episodes(tmp_path, capsys) -> None:
     run = tmp_path / "run"
-    sauna.train("worlds:Forgetful", out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9,
-                arm="ppo", **SMALL)  # fmt: skip
+    sauna.train(
+        "worlds:Forgetful",
+        out=run,
+        quiet=True,
+        checkpoint_every=2,
+        keep_checkpoints=9,
+        arm="ppo",
+        **SMALL,
+    )
     make_incomplete(run, 2)
     sauna.resume(run)
     assert "every environment starts a new episode" in capsys.readouterr().out
@@ -75,8 +82,9 @@ def make_incomplete(run: Path, iteration: int) -> None:
 
 def finished(tmp_path: Path, **settings) -> Path:
     run = tmp_path / "run"
-    sauna.train(WORLD, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9,
-                **{**SMALL, **settings})  # fmt: skip
+    sauna.train(
+        WORLD, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9, **{**SMALL, **settings}
+    )
     return run
 
 

@@ -13,8 +13,14 @@ from sauna.experiments.study.spec import check, read_spec
 from sauna.experiments.study.units import Unit, units_of
 from sauna.system import run_directory
 
-TWO = {"tasks": ["A-v0"], "seeds": 3, "steps": 10_000, "rollout_steps": 1000, "minibatches": 10,
-       "arms": [{"label": "ppo"}, {"label": "sauna"}]}  # fmt: skip
+TWO = {
+    "tasks": ["A-v0"],
+    "seeds": 3,
+    "steps": 10_000,
+    "rollout_steps": 1000,
+    "minibatches": 10,
+    "arms": [{"label": "ppo"}, {"label": "sauna"}],
+}
 
 
 class Broken(Executor):

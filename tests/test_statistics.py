@@ -389,8 +389,9 @@ def test_against_rliable(tmp_path: Path) -> None:
         pytest.skip(f"rliable cannot be installed here: {installed.stderr[-300:]}")
     data = {"x": x.tolist(), "y": y.tolist(), "thresholds": thresholds.tolist()}
     (tmp_path / "data.json").write_text(json.dumps(data))
-    run = subprocess.run([python, "-c", RLIABLE, tmp_path / "data.json"],
-                         capture_output=True, text=True, check=True)  # fmt: skip
+    run = subprocess.run(
+        [python, "-c", RLIABLE, tmp_path / "data.json"], capture_output=True, text=True, check=True
+    )
     theirs = json.loads(run.stdout.splitlines()[-1])
 
     pairs = list(zip(x.T, y.T, strict=True))

@@ -108,8 +108,9 @@ def test_a_coin_beside_a_masked_arm(tmp_path) -> None:
 )
 def test_the_advice_about_checkpoints_can_be_taken(given: dict, advice: tuple) -> None:
     text = {**TWO, "arms": [{"label": "sauna"}], "measure": "noise", **given}
-    with pytest.raises(BadInput, match="checkpoint_every = {} and keep_checkpoints = {}$".format(
-            *advice)):  # fmt: skip
+    with pytest.raises(
+        BadInput, match="checkpoint_every = {} and keep_checkpoints = {}$".format(*advice)
+    ):
         read_spec(text)
     every, kept = advice
     assert read_spec({**text, "checkpoint_every": every, "keep_checkpoints": kept}).measure
@@ -137,8 +138,10 @@ def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
     path.write_text('tasks = ["A-v0"]\nseeds = [4, 9]\nsteps = 1e5\n[[arms]]\nlabel = "ppo"\n')
     spec = load_spec(str(path))
     assert (spec.name, spec.arms[0].seeds, check(spec.arms[0], "A-v0").steps) == (
-        "mine", (4, 9), 100_000,
-    )  # fmt: skip
+        "mine",
+        (4, 9),
+        100_000,
+    )
     path.write_text("tasks = [")
     with pytest.raises(BadInput, match="cannot read"):
         load_spec(str(path))
@@ -323,8 +326,16 @@ def test_the_command_that_repeats_a_comparison() -> None:
 @pytest.mark.slow
 def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp_path) -> None:
     """SIGKILL leaves no orphan behind; SIGTERM saves and exits 143."""
-    command = [sys.executable, "-m", "sauna", "compare", "worlds:Scripted", "--out", str(tmp_path),
-               *FLAGS]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "sauna",
+        "compare",
+        "worlds:Scripted",
+        "--out",
+        str(tmp_path),
+        *FLAGS,
+    ]
     for number, pause in ((signal.SIGKILL, 6.0), (signal.SIGTERM, 9.0)):
         started = subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE, text=True)
         time.sleep(pause)

@@ -20,24 +20,49 @@ STEPS = [1000, 2000, 3000]
 LOW = [1300.0, 1310.0, 1325.0, 1290.0, 1301.0, 1333.0]
 HIGH = [1800.0, 1810.0, 1825.0, 1790.0, 1801.0, 1833.0]
 ALIKE = [1302.0, 1311.0, 1322.0, 1288.0, 1304.0, 1330.0]
-ROW = {"task", "label", "baseline", "seeds", "failed", "running", "final_iqm", "area_iqm",
-       "final_mean", "final_std", "keep_rate", "env_steps", "kept_steps",
-       "improvement"}  # fmt: skip
+ROW = {
+    "task",
+    "label",
+    "baseline",
+    "seeds",
+    "failed",
+    "running",
+    "final_iqm",
+    "area_iqm",
+    "final_mean",
+    "final_std",
+    "keep_rate",
+    "env_steps",
+    "kept_steps",
+    "improvement",
+}
 
 
 def member(seed: int, final: float | None, **changes: Any) -> dict[str, Any]:
     keep_rate = changes.get("keep_rate", 1.0)
     half = None if final is None else final / 2
     found = {
-        "seed": seed, "status": "complete", "error": None, "final_return": final, "area": half,
-        "env_steps": 3000, "kept_steps": int(3000 * keep_rate), "keep_rate": keep_rate,
-        "episodes": 9, "explained_variance": 0.5,
+        "seed": seed,
+        "status": "complete",
+        "error": None,
+        "final_return": final,
+        "area": half,
+        "env_steps": 3000,
+        "kept_steps": int(3000 * keep_rate),
+        "keep_rate": keep_rate,
+        "episodes": 9,
+        "explained_variance": 0.5,
         "curve": {
-            "env_steps": list(STEPS), "return_mean": [None, half, final],
-            "keep_rate": [keep_rate] * 3, "vex_mean": [None] * 3, "vex_spread": [None] * 3,
-            "vex_median": [None] * 3, "explained_variance": [0.1, 0.9, 1.0], "entropy": [1, 1, 1],
+            "env_steps": list(STEPS),
+            "return_mean": [None, half, final],
+            "keep_rate": [keep_rate] * 3,
+            "vex_mean": [None] * 3,
+            "vex_spread": [None] * 3,
+            "vex_median": [None] * 3,
+            "explained_variance": [0.1, 0.9, 1.0],
+            "entropy": [1, 1, 1],
         },
-    }  # fmt: skip
+    }
     return {**found, **changes}
 
 
@@ -45,8 +70,15 @@ def cell(
     label: str, finals: list[Any], task: str = "Cheetah", arm: str = "", **changes: Any
 ) -> dict[str, Any]:
     members = [member(seed, final, **changes) for seed, final in enumerate(finals)]
-    return {"task": task, "label": label, "arm": arm or label, "preset": "mujoco", "config": {},
-            "command": "", "members": members}  # fmt: skip
+    return {
+        "task": task,
+        "label": label,
+        "arm": arm or label,
+        "preset": "mujoco",
+        "config": {},
+        "command": "",
+        "members": members,
+    }
 
 
 def results(*cells: dict[str, Any]) -> dict[str, Any]:
@@ -179,8 +211,13 @@ def test_the_filter_is_held_against_the_head_alone_and_its_coin() -> None:
     """All three beat the baseline; what the head alone does is no merit of the filter."""
     coin = {**cell("coin", ALIKE, arm="random-drop", keep_rate=0.7), "rates_of": "sauna"}
     other = {**cell("other coin", LOW, arm="random-drop", keep_rate=0.7), "rates_of": "elsewhere"}
-    arms = [cell("ppo", [0.0] * 6), cell("vex-head", LOW), other, coin,
-            cell("sauna", HIGH, keep_rate=0.7)]  # fmt: skip
+    arms = [
+        cell("ppo", [0.0] * 6),
+        cell("vex-head", LOW),
+        other,
+        coin,
+        cell("sauna", HIGH, keep_rate=0.7),
+    ]
     found = summarize(results(*arms))
     assert [v["kind"] for v in found["verdicts"]] == ["better"] * 4
     told = {v["against"]: v for v in found["filtering"]}
@@ -266,9 +303,7 @@ def test_over_tasks() -> None:
     (row,) = summary["over_tasks"]
     pairs = [(np.array(ALIKE), np.array(LOW)), (np.array(HIGH), np.array(LOW))]
     expected = s.improvement_over_tasks(pairs)
-    assert row == {
-        "label": "sauna", "baseline": "ppo", "tasks": 2, "improvement": list(expected)
-    }  # fmt: skip
+    assert row == {"label": "sauna", "baseline": "ppo", "tasks": 2, "improvement": list(expected)}
     better = summary["verdicts"][1]
     assert better["kind"] == "better" and "not corrected for the 2 tasks." in better["text"]
     assert summarize(results(*two[:2]))["over_tasks"] == []

@@ -20,8 +20,13 @@ from sauna.experiments.study.units import seeds_per_unit, units_of
 from sauna.system.errors import BadInput
 from test_cli import sauna
 
-TORSO = {"name": "t", "measure": "torso", "tasks": ["HalfCheetah-v5"], "seeds": 6,
-         "arms": [{"label": "ppo"}, {"label": "sauna"}]}  # fmt: skip
+TORSO = {
+    "name": "t",
+    "measure": "torso",
+    "tasks": ["HalfCheetah-v5"],
+    "seeds": 6,
+    "arms": [{"label": "ppo"}, {"label": "sauna"}],
+}
 
 
 def test_the_pitch_is_the_torsos_in_the_world() -> None:
@@ -45,16 +50,20 @@ def test_its_runs_are_those_of_the_thirty_seeds() -> None:
     assert len(ours.arms) == 2 and all(len(arm.seeds) >= 20 for arm in ours.arms)
     for cores in (1, 2, 8, 16, 20):
         sizes = [seeds_per_unit(spec, cores) for spec in (ours, theirs)]
-        names = [{unit.name for unit in units_of(spec, size)}
-                 for spec, size in zip((ours, theirs), sizes, strict=True)]  # fmt: skip
+        names = [
+            {unit.name for unit in units_of(spec, size)}
+            for spec, size in zip((ours, theirs), sizes, strict=True)
+        ]
         assert names[0] < names[1], cores
 
 
 @pytest.mark.parametrize(
     "change, message",
-    [({"tasks": ["Hopper-v5"]}, "is of HalfCheetah, not of Hopper-v5"),
-     ({"measure": "torsoo"}, "did you mean 'torso'")],
-)  # fmt: skip
+    [
+        ({"tasks": ["Hopper-v5"]}, "is of HalfCheetah, not of Hopper-v5"),
+        ({"measure": "torsoo"}, "did you mean 'torso'"),
+    ],
+)
 def test_what_has_no_torso_is_refused(change: dict, message: str) -> None:
     assert read_spec(TORSO).measure == "torso"
     with pytest.raises(BadInput, match=message):
@@ -64,14 +73,28 @@ def test_what_has_no_torso_is_refused(change: dict, message: str) -> None:
 def cell(label: str, upright: list[float], baseline: str | None, seeds: int = 30) -> dict[str, Any]:
     """Measured members 0, 1, ...; who is upright earns 3000, who is not 1000."""
     members = [
-        {"seed": seed, "points": [{
-            "upright": share, "stills": [*STILLS], "picture": f"{label}-{seed}.png",
-            "episodes": [{"return": 1000.0 + 2000.0 * (share > 0.5), "upright": share}] * 2,
-        }], "curve": {"env_steps": [10, 20], "explained_variance": [None, 0.1 * seed]}}
+        {
+            "seed": seed,
+            "points": [
+                {
+                    "upright": share,
+                    "stills": [*STILLS],
+                    "picture": f"{label}-{seed}.png",
+                    "episodes": [{"return": 1000.0 + 2000.0 * (share > 0.5), "upright": share}] * 2,
+                }
+            ],
+            "curve": {"env_steps": [10, 20], "explained_variance": [None, 0.1 * seed]},
+        }
         for seed, share in enumerate(upright)
-    ]  # fmt: skip
-    return {"task": "HalfCheetah-v5", "label": label, "arm": label, "baseline": baseline,
-            "seeds": seeds, "members": members}  # fmt: skip
+    ]
+    return {
+        "task": "HalfCheetah-v5",
+        "label": label,
+        "arm": label,
+        "baseline": baseline,
+        "seeds": seeds,
+        "members": members,
+    }
 
 
 def measured(base: list[float], own: list[float], seeds: int = 30) -> dict[str, Any]:
@@ -99,8 +122,10 @@ def test_shares_and_pairs_by_hand() -> None:
 def test_a_difference_is_told_and_equal_ones_are_not() -> None:
     [pair] = posture_report.pairs(measured([0.0] * 9, [1.0] * 9))
     assert math.isclose(pair.p, 2 / 2**9)
-    assert "sauna against ppo, seed by seed: more seeds on their feet" in posture_report.verdicts(
-        measured([0.0] * 9, [1.0] * 9))[2]  # fmt: skip
+    assert (
+        "sauna against ppo, seed by seed: more seeds on their feet"
+        in posture_report.verdicts(measured([0.0] * 9, [1.0] * 9))[2]
+    )
     assert "fewer seeds on their feet" in posture_report.verdicts(measured([1.0] * 9, [0.0] * 9))[2]
     same = [1.0, 0.0] * 5
     assert next(iter(posture_report.pairs(measured(same, same)))).p == 1.0
@@ -117,8 +142,9 @@ def test_what_is_not_measured_yet_is_told() -> None:
         "No seed is trained to its end and measured yet."
     ]
     alone = {"cells": [cell("ppo", [1.0, 0.0], None)]}
-    assert posture_report.verdicts(alone) == ["ppo: on its feet in 1 of 2 seeds, of 30 in all, "
-                                     "(50% [9%, 91%])."]  # fmt: skip
+    assert posture_report.verdicts(alone) == [
+        "ppo: on its feet in 1 of 2 seeds, of 30 in all, (50% [9%, 91%])."
+    ]
     part = measured([0.0, 0.0, 1.0], [1.0])
     [pair] = posture_report.pairs(part)
     assert (pair.seeds, pair.gained, pair.lost) == (1, 1, 0)
@@ -152,7 +178,9 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
     assert not (upper == (200, 50, 0)).all(-1).any()
     [plot] = extra.plots
     assert [(line.label, line.y) for line in plot.panels[0].lines] == [
-        ("ppo", [None, 0.1 * 3]), ("sauna", [None, 0.1 * 3])]  # fmt: skip
+        ("ppo", [None, 0.1 * 3]),
+        ("sauna", [None, 0.1 * 3]),
+    ]
     assert "ppo seed 3, on its back (return 1,000), sauna seed 3, on its feet" in extra.html
     assert 'src="data:image/png;base64,' in extra.html
     for one in found["cells"]:

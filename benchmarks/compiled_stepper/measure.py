@@ -66,19 +66,66 @@ class Fields(ctypes.Structure):
     """`Stepper` of stepper.cpp."""
 
     _fields_ = (
-        [(name, ctypes.c_int32) for name in
-         ("members", "rows", "nq", "nv", "nu", "frame_skip", "limit", "judged",
-          "normal_velocity", "given")]
+        [
+            (name, ctypes.c_int32)
+            for name in (
+                "members",
+                "rows",
+                "nq",
+                "nv",
+                "nu",
+                "frame_skip",
+                "limit",
+                "judged",
+                "normal_velocity",
+                "given",
+            )
+        ]
         + [("reset_count", ctypes.c_int64)]
-        + [(name, ctypes.c_double) for name in
-           ("dt", "forward_weight", "control_cost", "healthy_reward", "speed_limit",
-            "reset_scale", "clip")]
-        + [(name, ctypes.c_void_p) for name in
-           ("model", "data", "low", "high", "healthy_low", "healthy_high", "initial", "first",
-            "second", "head", "mean", "variance", "count", "seen", "length", "random", "resets",
-            "next_reset", "observation", "action", "final_observation", "means", "reward",
-            "states", "terminated", "truncated")]
-    )  # fmt: skip
+        + [
+            (name, ctypes.c_double)
+            for name in (
+                "dt",
+                "forward_weight",
+                "control_cost",
+                "healthy_reward",
+                "speed_limit",
+                "reset_scale",
+                "clip",
+            )
+        ]
+        + [
+            (name, ctypes.c_void_p)
+            for name in (
+                "model",
+                "data",
+                "low",
+                "high",
+                "healthy_low",
+                "healthy_high",
+                "initial",
+                "first",
+                "second",
+                "head",
+                "mean",
+                "variance",
+                "count",
+                "seen",
+                "length",
+                "random",
+                "resets",
+                "next_reset",
+                "observation",
+                "action",
+                "final_observation",
+                "means",
+                "reward",
+                "states",
+                "terminated",
+                "truncated",
+            )
+        ]
+    )
 
 
 def build() -> ctypes.CDLL:
@@ -86,8 +133,16 @@ def build() -> ctypes.CDLL:
     library = next(package.glob("libmujoco.so.*"))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "stepper.so"
-        command = ["g++", *FLAGS, f"-I{package / 'include'}", str(HERE / "stepper.cpp"),
-                   str(library), f"-Wl,-rpath,{package}", "-o", str(out)]  # fmt: skip
+        command = [
+            "g++",
+            *FLAGS,
+            f"-I{package / 'include'}",
+            str(HERE / "stepper.cpp"),
+            str(library),
+            f"-Wl,-rpath,{package}",
+            "-o",
+            str(out),
+        ]
         subprocess.run(command, check=True)
         built = ctypes.CDLL(str(out))
     built.raw.restype = ctypes.c_double
@@ -129,8 +184,10 @@ class CompiledCollector(HostCollector):
         """The arrays that the stepper reads and writes; most are the collector's own."""
         bare, number = [slot.env.unwrapped for slot in envs._slots], len(envs._slots)
         moments, buffers = self.observation_moments, self._buffers
-        shared = {name: getattr(buffers, name) for name in
-                  ("observation", "action", "terminated", "truncated")}  # fmt: skip
+        shared = {
+            name: getattr(buffers, name)
+            for name in ("observation", "action", "terminated", "truncated")
+        }
         shared |= {name: getattr(moments, name) for name in ("mean", "variance", "count")}
         shared |= zip(("first", "second", "head"), self._actor._weights, strict=True)
         shared |= {
@@ -314,19 +371,23 @@ def validate(case: Case, library: ctypes.CDLL) -> tuple[CompiledCollector, dict[
     report = {
         "states_equal": bool(np.array_equal(states, np.stack(recorded.states, 1))),
         "moments_equal": all(
-            np.array_equal(getattr(replayed.observation_moments, name),
-                           getattr(today.observation_moments, name))
+            np.array_equal(
+                getattr(replayed.observation_moments, name),
+                getattr(today.observation_moments, name),
+            )
             for name in ("mean", "variance", "count")
         ),
         "rollout_equal": {
-            name: all(np.array_equal(getattr(a.rollout, name), getattr(b.rollout, name))
-                      for a, b in zip(found, expected, strict=True))
+            name: all(
+                np.array_equal(getattr(a.rollout, name), getattr(b.rollout, name))
+                for a, b in zip(found, expected, strict=True)
+            )
             for name in expected[0].rollout._fields
         },
         "episodes_equal": [c.episodes for c in found] == [c.episodes for c in expected],
         "episodes": sum(len(collected.episodes) for collected in expected),
         "largest_mean_difference": mean_difference(replayed),
-    }  # fmt: skip
+    }
     return replayed, report
 
 
@@ -352,9 +413,10 @@ def validate_acting(case: Case, collector: CompiledCollector) -> dict[str, float
     found = {
         "own_actions_largest_mean_difference": mean_difference(collector),
         "own_actions_are_mean_plus_noise": bool(np.array_equal(chosen, action)),
-        "own_actions_episodes": int(np.sum(collector._buffers.terminated)
-                                    + np.sum(collector._buffers.truncated)),
-    }  # fmt: skip
+        "own_actions_episodes": int(
+            np.sum(collector._buffers.terminated) + np.sum(collector._buffers.truncated)
+        ),
+    }
     collector.fields.means = collector.fields.states = None
     return found
 
@@ -496,8 +558,11 @@ def tables(result: dict[str, Any]) -> str:
             lines.append(f"| {label} | " + " | ".join(cells) + " |")
     lines += ["", "| compiled times today | " + " | ".join(cases) + " |"]
     lines.append("|---|" + "---|" * len(cases))
-    parts = {"acting": "acting and stepping alone", "collect": "all of collecting",
-             "training": "collecting and update"}  # fmt: skip
+    parts = {
+        "acting": "acting and stepping alone",
+        "collect": "all of collecting",
+        "training": "collecting and update",
+    }
     for part, label in parts.items():
         found = [case["compiled_to_today"][part] for case in cases.values()]
         cells = [f"{f['median']:.2f} ({f['low']:.2f} to {f['high']:.2f})" for f in found]

@@ -25,8 +25,14 @@ RESULTS = ROOT / "results" / "checks.json"
 HOST = {"env": "HalfCheetah-v5", "arm": "ppo", "steps": 1_000_000}
 MEMBERS = (1, 3)
 ROUNDS = 5
-DEVICE = {"env": "gymnax/CartPole-v1", "arm": "ppo", "envs": 16, "rollout_steps": 128,
-          "minibatches": 32, "steps": 10_000_000}  # fmt: skip
+DEVICE = {
+    "env": "gymnax/CartPole-v1",
+    "arm": "ppo",
+    "envs": 16,
+    "rollout_steps": 128,
+    "minibatches": 32,
+    "steps": 10_000_000,
+}
 # What `helpers.make_job` would make small otherwise.
 PRESET = {"minibatches": 32, "epochs": 10, "hidden": "64,64", "rollout_steps": 2048}
 TURNS = 300

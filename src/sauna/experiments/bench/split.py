@@ -32,8 +32,18 @@ from sauna.training.loop.member_state import Counters
 from sauna.training.loop.metrics import metrics_row
 from sauna.training.prepare import settle
 
-SECTIONS = ("physics", "environment", "normalisation", "inference", "filter", "bookkeeping",
-            "update", "checks", "logging", "checkpoints")  # fmt: skip
+SECTIONS = (
+    "physics",
+    "environment",
+    "normalisation",
+    "inference",
+    "filter",
+    "bookkeeping",
+    "update",
+    "checks",
+    "logging",
+    "checkpoints",
+)
 ITERATIONS = 6
 
 
@@ -103,8 +113,14 @@ def _timed(program: Program, timers: Timers) -> Program:
     def waiting(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *arguments: jax.block_until_ready(function(*arguments))
 
-    sections = {"draw": "inference", "act": "inference", "score": "inference",
-                "value": "inference", "make_batch": "update", "learn": "update"}  # fmt: skip
+    sections = {
+        "draw": "inference",
+        "act": "inference",
+        "score": "inference",
+        "value": "inference",
+        "make_batch": "update",
+        "learn": "update",
+    }
     wrapped: dict[str, Any] = {
         name: timers.wrap(section, waiting(getattr(program, name)))
         for name, section in sections.items()

@@ -94,9 +94,16 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     rates = stored["drop_rates"][place] if stored["drop_rates"] else []
     hypers = hypers_now(everyone[place].config, rates, counters, iteration)
     return Standing(
-        config, spaces, everyone[place], iteration, program, params, hypers, arrays,
+        config,
+        spaces,
+        everyone[place],
+        iteration,
+        program,
+        params,
+        hypers,
+        arrays,
         counters.env_steps,
-    )  # fmt: skip
+    )
 
 
 def fresh_streams(

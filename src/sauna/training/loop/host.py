@@ -60,10 +60,15 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
                 counters[p].add(collected[p])
                 rows.append(
                     metrics_row(
-                        members[p], config, iteration, collected[p], counters[p], learned,
+                        members[p],
+                        config,
+                        iteration,
+                        collected[p],
+                        counters[p],
+                        learned,
                         hypers[p],
                     )
-                )  # fmt: skip
+                )
             timing = {
                 "env_steps": sum(collected[p].env_steps for p in np.flatnonzero(limit)),
                 "seconds": time.perf_counter() - clock,
