@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from helpers import SMALL, environment
+from command_line import sauna, small_flags
 from sauna import cli
 from sauna.config.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
 from sauna.config.settings import FIELDS, flag, parse, to_json
@@ -18,20 +17,6 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
 WORLD = "worlds:Scripted"
-
-
-def sauna(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "sauna", *arguments],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env=environment(),
-    )
-
-
-def small_flags(**changes: object) -> list[str]:
-    return [f"{flag(k)}={v}" for k, v in {**SMALL, **changes}.items()]
 
 
 BAD = [

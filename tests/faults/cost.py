@@ -66,6 +66,7 @@ def of_the_update() -> float:
     import jax
 
     from helpers import make_job
+    from sauna.algorithm.learner.program import make_learner
     from sauna.algorithm.learner.update import minibatch_order
     from sauna.algorithm.rollout.host import HostCollector
     from sauna.algorithm.rollout.program import make_program
@@ -82,15 +83,16 @@ def of_the_update() -> float:
         envs = make_envs(job)
         collector = HostCollector(program, job.spaces, envs, [key])
         collector.start()
-        state = program.init(key.init)
+        learner = make_learner(job.config, program.policy)
+        state = learner.init(key.init)
         limit = np.array([job.config.rollout_steps])
         (told,) = collector.collect(np.asarray(state.params)[None], [hypers], 0, limit)
         envs.close()
-        batch = program.make_batch(told.rollout, hypers)
+        batch = learner.make_batch(told.rollout, hypers)
 
         def call() -> None:
             nonlocal state  # used up by each call
-            state, metrics = program.learn(state, told.rollout, batch, hypers, order)
+            state, metrics = learner.learn(state, told.rollout, batch, hypers, order)
             jax.block_until_ready(metrics)
 
         call()

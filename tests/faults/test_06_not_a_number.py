@@ -144,7 +144,7 @@ def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
     tally.count("inside of a rollout")
     try:
         collector.start()
-        params = np.stack([np.asarray(program.init(key.init).params)])
+        params = np.stack([np.asarray(program.policy.init(key.init))])
         collector.collect(params, [hypers], 0, np.array([64]))
         tally.miss(f"{kwargs}: a rollout was filled with it")
     except EnvironmentFailure:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers import SMALL, Recorder, equal, make_job, own, resumed, train_here
+from helpers import SMALL, TESTS, Recorder, equal, make_job, own, resumed, train_here
 from jax_worlds import LENGTH, walk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.device import Collecting, collect, start
@@ -76,7 +76,7 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
     job = make_job("jax_worlds:walk", arm=arm, envs=N, **settings)
     config, keys = job.config, member_keys(7)
     program = make_program(config, job.spaces)
-    params = program.init(keys.init).params
+    params = program.policy.init(keys.init)
     hypers = Hypers(*(np.float32(getattr(job.members[0].config, f)) for f in Hypers._fields))
     env = flat(walk)
     envs = SteppedHere(env, N, keys.env, config.reset == "cached")
@@ -282,7 +282,7 @@ def test_bad_input_is_refused(
 
 @slow
 def test_the_environment_of_the_docs_trains(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parent.parent / "docs" / "device.md").read_text()
+    text = (Path(TESTS).parent / "docs" / "device.md").read_text()
     (tmp_path / "my_envs.py").write_text(text.split("```python\n")[1].split("```")[0])
     monkeypatch.syspath_prepend(str(tmp_path))
     result = train_here(make_job("my_envs:near_zero", arm="ppo", envs=2))

@@ -20,12 +20,12 @@ from typing import Any
 
 import pytest
 
+from helpers import TESTS
 from sauna import cli
 from sauna.experiments.study.execute import ray_files
 from sauna.experiments.study.execute.ray_node import Hub
 from sauna.experiments.study.tables import settings
 
-TESTS = str(Path(__file__).parent)
 MARK = "SAUNA_TEST_CLUSTER"  # in the environment of every process that a test starts
 STUDY = """
 tasks = ["worlds:Scripted"]

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 from helpers import make_job
+from oracles import RunningNormalizer
+from sauna.algorithm.learner.program import make_learner
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import member_keys
@@ -25,20 +27,6 @@ from sauna.training.loop.member_state import Counters
 from worlds import Scripted
 
 T, N = 24, 2
-
-
-class RunningNormalizer:
-    """baselines' RunningMeanStd and VecNormalize, one number at a time."""
-
-    def __init__(self, size: int) -> None:
-        self.mean, self.var, self.count = np.zeros(size), np.ones(size), 1e-4
-
-    def update(self, batch: np.ndarray) -> None:
-        mean, var, number = batch.mean(0), batch.var(0), len(batch)
-        delta, total = mean - self.mean, self.count + number
-        m2 = self.var * self.count + var * number + delta**2 * self.count * number / total
-        self.mean = self.mean + delta * number / total
-        self.var, self.count = m2 / total, total
 
 
 class Actors:
@@ -171,8 +159,9 @@ class Setup:
         )
         self.job, self.config = job, job.config
         self.program = make_program(job.config, job.spaces)
+        self.learner = make_learner(job.config, self.program.policy)
         self.keys = member_keys(3)
-        self.params = self.program.init(self.keys.init).params
+        self.params = self.program.policy.init(self.keys.init)
         envs = GymnasiumEnvs(Scripted, [(3, n) for n in range(N)])
         self.collector = HostCollector(self.program, job.spaces, envs, [self.keys])
         self.collector.start()
@@ -183,7 +172,7 @@ class Setup:
         collected = self.collector.collect(
             np.asarray(self.params)[None], [self.hypers], iteration, limit
         )[0]
-        return collected, self.program.make_batch(collected.rollout, self.hypers)
+        return collected, self.learner.make_batch(collected.rollout, self.hypers)
 
     def act(self, seen, noise):
         action = np.asarray(self.program.act(self.params[None], seen[None], noise[None]))[0]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from arrays import VECTOR, hypers, random_batch
 from helpers import configured
 from sauna import train
 from sauna.algorithm.learner.update import minibatch_losses
@@ -32,7 +33,6 @@ from sauna.experiments.measure.streams import (
 )
 from sauna.experiments.study.spec import read_spec
 from sauna.system.errors import BadInput
-from test_losses import VECTOR, hypers, random_batch
 
 PAIRS = (("dropped", "coin"),)
 GROUPS = ("dropped", "coin")

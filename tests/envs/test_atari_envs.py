@@ -14,7 +14,7 @@ import pytest
 from ale_py import roms
 from ale_py.vector_env import AtariVectorEnv
 
-from helpers import equal, make_job, resumed, train_here
+from helpers import assert_same_step, equal, make_job, resumed, train_here
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import Hypers, member_keys
@@ -25,7 +25,6 @@ from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
 from sauna.system.errors import BadInput
 from sauna.training.loop.host import make_envs
-from test_envs import assert_same_step
 
 BREAKOUT = "ALE/Breakout-v5"
 SEEDS = [(3, 0), (5, 1)]
@@ -226,7 +225,7 @@ def test_a_lost_life_ends_what_is_learned_and_not_what_is_told() -> None:
     program, keys = make_program(job.config, job.spaces), member_keys(0)
     collector = HostCollector(program, job.spaces, make_envs(job), [keys])
     collector.start()
-    params = np.asarray(program.init(keys.init).params)[None]
+    params = np.asarray(program.policy.init(keys.init))[None]
     hypers = Hypers(*(np.float32(getattr(job.config, name)) for name in Hypers._fields))
     rollout, *_, episodes = collector.collect(params, [hypers], 0, np.array([12]))[0]
     np.testing.assert_array_equal(rollout.terminated[:, 0], [False, True] * 6)

@@ -9,7 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sauna.envs.host.contract import HostEnvs, Step, episode_seed
+from helpers import assert_same_step
+from sauna.envs.host.contract import HostEnvs, episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.make import env_maker, make_drawn_env
 from sauna.envs.probe import probe
@@ -35,13 +36,6 @@ backends = pytest.mark.parametrize("make", [in_process, in_workers])
 
 def actions(number: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(number, len(SEEDS), 2)).astype(np.float32)
-
-
-def assert_same_step(one: Step, two: Step) -> None:
-    ended = one.terminated | one.truncated
-    for a, b in zip(one[:4], two[:4], strict=True):
-        np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])
 
 
 @backends

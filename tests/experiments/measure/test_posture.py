@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from command_line import sauna
 from sauna.experiments.measure import posture_report
 from sauna.experiments.measure.posture import SIDE, STILLS, clearest, pitch
 from sauna.experiments.study.spec import load_spec, read_spec
 from sauna.experiments.study.units import seeds_per_unit, units_of
 from sauna.system.errors import BadInput
-from test_cli import sauna
 
 TORSO = {
     "name": "t",

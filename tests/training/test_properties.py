@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from arrays import random_rollout
 from helpers import configured
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import Hypers, member_keys
 from sauna.envs.spaces import Spaces
 from sauna.system import checkpoint
-from test_advantages import random_rollout
 
 CONFIG = configured(rollout_steps=40, envs=3, minibatches=4, epochs=2, hidden="5", arm="sauna")
 PROGRAM = make_program(CONFIG, Spaces("vector", (2,), "continuous", (1,), "", ""))

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from arrays import random_rollout
 from sauna.algorithm.learner.metrics import head_statistics, variance_explained
 from sauna.algorithm.learner.samples import episode_numbers, kept_rows
 from sauna.algorithm.learner.vex_targets import TARGETS
-from test_advantages import random_rollout
 
 
 def sample(seed: int = 0) -> tuple[np.ndarray, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
+from command_line import sauna, small_flags
 from helpers import SMALL, environment
 from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
@@ -30,7 +31,6 @@ from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
-from test_cli import sauna, small_flags
 
 TWO = {"tasks": ["A-v0"], "seeds": 6, "arms": [{"label": "ppo"}, {"label": "sauna"}]}
 QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from arrays import random_rollout
 from helpers import configured
 from sauna.algorithm.learner.advantages import gae
 from sauna.algorithm.learner.samples import advantages_over_all, make_batch
@@ -19,29 +20,6 @@ from sauna.algorithm.types import Hypers, Rollout
 def hypers(**values: float) -> Hypers:
     start = dict.fromkeys(Hypers._fields, 0.0) | {"gamma": 0.9, "gae_lambda": 0.8}
     return Hypers(**{k: np.float64(v) for k, v in {**start, **values}.items()})
-
-
-def random_rollout(seed: int, steps: int = 40, envs: int = 3, keep_rate: float = 1.0) -> Rollout:
-    rng = np.random.default_rng(seed)
-    shape = (steps, envs)
-    terminated = rng.random(shape) < 0.1
-    truncated = (rng.random(shape) < 0.1) & ~terminated
-    value = rng.normal(size=shape)
-    next_value = np.where(terminated | truncated, rng.normal(size=shape), np.roll(value, -1, 0))
-    next_value[-1] = rng.normal(size=envs)
-    return Rollout(
-        observation=rng.normal(size=(*shape, 2)),
-        action=rng.normal(size=(*shape, 1)),
-        log_prob=rng.normal(size=shape),
-        reward=rng.normal(size=shape),
-        value=value,
-        next_value=next_value,
-        vex=rng.normal(size=shape),
-        terminated=terminated,
-        truncated=truncated,
-        valid=np.ones(shape, bool),
-        keep=rng.random(shape) < keep_rate,
-    )
 
 
 def loop_gae(rollout: Rollout, gamma: float, lam: float, bootstrap_truncated: bool) -> np.ndarray:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from arrays import hypers, random_batch, random_rollout
 from helpers import Recorder, configured, equal, make_job, own, resumed, train_here
 from sauna.algorithm.learner import a2c
 from sauna.algorithm.learner.samples import make_batch
@@ -26,8 +27,6 @@ from sauna.system.checkpoint import BadCheckpoint
 from sauna.system.errors import BadInput
 from sauna.training.loop.member_state import named_optimizer, unpack_optimizer
 from sauna.training.worker import train_members
-from test_advantages import random_rollout
-from test_losses import hypers, random_batch
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 WORLD = "worlds:Scripted"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from arrays import hypers, random_batch, random_rollout
 from helpers import configured
 from sauna.algorithm.learner.metrics import head_statistics
 from sauna.algorithm.learner.ppo import combine
@@ -20,8 +21,6 @@ from sauna.algorithm.selection.random_drop import random_drop
 from sauna.algorithm.selection.vex_filter import informative, sauna_per_env
 from sauna.algorithm.types import Hypers, Keys, Rollout, member_keys
 from sauna.envs.spaces import Spaces
-from test_advantages import random_rollout
-from test_losses import hypers, random_batch
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 CONFIG = configured(rollout_steps=40, envs=3, minibatches=4)

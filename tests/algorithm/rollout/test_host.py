@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import make_job, train_here
+from oracles import RunningNormalizer
 from sauna.algorithm.policy.normalize import (
     Moments,
     initial_moments,
@@ -15,7 +16,6 @@ from sauna.algorithm.policy.normalize import (
     update_moments,
 )
 from sauna.algorithm.rollout.moments import ObservationMoments
-from test_reference import RunningNormalizer
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sauna
-from helpers import SMALL
+from helpers import SMALL, TESTS
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.training import prepare
@@ -47,7 +47,7 @@ def start(out: Path, *more: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        cwd=Path(__file__).parent,
+        cwd=TESTS,
     )
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from helpers import make_job
+from sauna.algorithm.learner.program import Learner, make_learner
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout import actor, moments
 from sauna.algorithm.rollout.host import HostCollector
-from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.rollout.program import Program, make_program
 from sauna.algorithm.types import member_keys
 from sauna.envs.host import mujoco_envs, mujoco_tasks
 from sauna.training.loop.budget import hypers_of, step_limit
@@ -35,20 +36,22 @@ class Trainer:
         self.job = make_job(env, seeds=MEMBERS, steps=10**6, **settings)
         self.calls: Counter[str] = Counter()
         self.program = make_program(self.job.config, self.job.spaces)
-        counted = {name: self._counted(name) for name in FUNCTIONS}
+        self.learner = make_learner(self.job.config, self.program.policy)
+        counted = {n: self._counted(self.program, n) for n in FUNCTIONS if n in Program._fields}
+        learned = {n: self._counted(self.learner, n) for n in FUNCTIONS if n in Learner._fields}
         self.keys = [member_keys(member.seed) for member in self.job.members]
         self.envs = make_envs(self.job)
         self.collector = HostCollector(
             self.program._replace(**counted), self.job.spaces, self.envs, self.keys
         )
         self.collector.start()
-        self.counted = self.program._replace(**counted)
-        self.states = [self.program.init(k.init) for k in self.keys]
+        self.counted = self.learner._replace(**learned)
+        self.states = [self.learner.init(k.init) for k in self.keys]
         self.done = [Counters() for _ in self.keys]
         self.changed: dict[str, Any] = {}  # hyperparameters, from now on
 
-    def _counted(self, name: str) -> Any:
-        function = getattr(self.program, name)
+    def _counted(self, where: Any, name: str) -> Any:
+        function = getattr(where, name)
 
         def call(*arguments: Any) -> Any:
             self.calls[name] += 1

@@ -8,38 +8,12 @@ import numpy as np
 import optax
 import pytest
 
+from arrays import VECTOR, hypers, random_batch
 from helpers import configured
 from sauna.algorithm.learner.ppo import combine, standardize, surrogate, value_error
 from sauna.algorithm.learner.update import init_state, minibatch_losses, minibatch_order, update
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy
-from sauna.algorithm.types import Batch, Hypers
-from sauna.envs.spaces import Spaces
-
-VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
-
-
-def hypers(**values: float) -> Hypers:
-    start = {
-        "learning_rate": 0.01,
-        "clip_range": 0.2,
-        "gamma": 0.9,
-        "gae_lambda": 0.8,
-        "entropy_coef": 0.01,
-        "value_coef": 0.5,
-        "vex_coef": 0.3,
-        "max_grad_norm": 0.5,
-        "threshold": 0.3,
-        "drop_rate": 0.0,
-    }
-    return Hypers(**{k: np.float64(v) for k, v in {**start, **values}.items()})
-
-
-def random_batch(number: int = 24, seed: int = 0) -> Batch:
-    rng = np.random.default_rng(seed)
-    weight = (rng.random(number) < 0.8).astype(float)
-    draw = lambda *shape: rng.normal(size=(number, *shape))  # noqa: E731
-    return Batch(draw(3), draw(2), draw() - 2.5, draw(), draw(), draw(), draw(), weight)
 
 
 def numpy_losses(log_ratio, advantage, value, old, return_, vex, target, entropy, w, h):

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from arrays import hypers
 from helpers import configured, equal, make_job, own, resumed, train_here
 from sauna.algorithm.rollout.program import decide
 from sauna.algorithm.selection import vex_filter
@@ -29,7 +30,6 @@ from sauna.algorithm.types import Filter
 from sauna.system.errors import BadInput
 from sauna.training.loop.budget import hypers_now, scheduled
 from sauna.training.loop.member_state import Counters
-from test_losses import hypers
 
 
 def run(filter: Filter, vex: np.ndarray, threshold: float = 0.3, rate: float = 0.0) -> np.ndarray:
