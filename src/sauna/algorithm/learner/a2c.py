@@ -45,7 +45,7 @@ def losses(
     log_prob = distribution.log_prob(output.policy, rows.action)
     log_prob = jnp.where(rows.weight > 0, log_prob, 0.0)
     entropy = distribution.entropy(output.policy)
-    log_prob, mask, scale = weigh_policy(
+    log_prob, mask, scale, effective = weigh_policy(
         output, minibatch, log_prob, log_prob, entropy, distribution=distribution, rules=rules
     )
     terms = -log_prob * minibatch.advantage
@@ -59,4 +59,4 @@ def losses(
     mean_entropy = weighted_mean(entropy, rows.weight)
     total = weigh(policy_loss, value_loss, vex_loss, mean_entropy, hypers)
     none = jnp.full_like(total, jnp.nan)
-    return Losses(total, policy_loss, value_loss, vex_loss, mean_entropy, none, none)
+    return Losses(total, policy_loss, value_loss, vex_loss, mean_entropy, none, none, effective)

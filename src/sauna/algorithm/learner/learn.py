@@ -57,7 +57,7 @@ def learn(
         state, losses, gradient_norm = update_on_all(
             state, learned_from, hypers, order, parts=parts
         )
-        work = _all_work(batch, parts)
+        work = _all_work(batch, losses, parts)
         sound = jnp.isfinite(losses.total)
     metrics = UpdateMetrics(
         losses.policy_loss,
@@ -104,13 +104,16 @@ def _means(
     return losses, totals.gradient_norm / steps, work
 
 
-def _all_work(batch: Batch, parts: Parts) -> Work:
+def _all_work(batch: Batch, losses: Losses, parts: Parts) -> Work:
     config = parts.config
+    effective = losses.effective_size
+    if effective is None:
+        effective = jnp.sum(batch.weight) / config.minibatches
     steps, rows = config.epochs * config.minibatches, config.rollout_steps * config.envs
     return Work(
         gradient_steps=jnp.float32(steps),
         sample_rate=jnp.float32(1.0),
         samples_forward=jnp.float32(config.epochs * rows),
         samples_backward=jnp.float32(config.epochs * rows),
-        effective_sample_size=jnp.sum(batch.weight) / config.minibatches,
+        effective_sample_size=effective,
     )

@@ -48,7 +48,7 @@ def losses(
     log_prob = distribution.log_prob(output.policy, rows.action)
     log_ratio = jnp.where(rows.weight > 0, log_prob - rows.log_prob, 0.0)
     entropy = distribution.entropy(output.policy)
-    log_ratio, mask, scale = weigh_policy(
+    log_ratio, mask, scale, effective = weigh_policy(
         output, minibatch, log_prob, log_ratio, entropy, distribution=distribution, rules=rules
     )
     form = rules.objective or surrogate
@@ -68,7 +68,17 @@ def losses(
     outside = (jnp.abs(ratio - 1.0) > hypers.clip_range).astype(ratio.dtype)
     clip_fraction = weighted_mean(outside, rows.weight)
     stop = None if rules.stop is None else rules.stop.exceeded(log_ratio, rows.weight)
-    return Losses(total, policy_loss, value_loss, vex_loss, mean_entropy, kl, clip_fraction, stop)
+    return Losses(
+        total,
+        policy_loss,
+        value_loss,
+        vex_loss,
+        mean_entropy,
+        kl,
+        clip_fraction,
+        effective,
+        stop,
+    )
 
 
 def surrogate(log_ratio: Array, advantage: Array, clip_range: Array) -> Array:

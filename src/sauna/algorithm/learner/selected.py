@@ -248,10 +248,12 @@ def _counted(
 ) -> tuple[TrainState, Totals]:
     """Takes the step and counts it, unless the stop rule says that it is one too many."""
     stop = jnp.bool_(False) if losses.stop is None else losses.stop
-    scale = 1.0 if part.policy_scale is None else part.policy_scale
-    effective = effective_size(part.policy_mask * scale)
+    effective = losses.effective_size
+    if effective is None:
+        scale = 1.0 if part.policy_scale is None else part.policy_scale
+        effective = effective_size(part.policy_mask * scale)
     more = Totals(
-        jax.tree.map(jnp.add, totals.losses, losses._replace(stop=None)),
+        jax.tree.map(jnp.add, totals.losses, losses._replace(stop=None, effective_size=None)),
         totals.gradient_norm + norm,
         totals.steps + 1,
         totals.effective_size + effective,
