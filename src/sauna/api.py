@@ -16,7 +16,8 @@ from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
 
-PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
+# what a user may pass by value
+PARTS = ("env", "network", "filter", "vex_target", "sampler", "loss_weight", "stop")
 
 
 class Result:

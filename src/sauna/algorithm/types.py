@@ -93,9 +93,12 @@ class Keys(NamedTuple):
     order: Array  # of minibatches drawn on the accelerator; see `minibatch_order`
 
 
+SELECTION = 2**31 - 1  # no epoch has this number: epoch e's order has the key of number e
+
+
 def selection_key(keys: Keys, iteration: Any) -> Array:
     """The key of an iteration's draws by a rule of selection, on the host and on the device."""
-    return jax.random.fold_in(jax.random.fold_in(keys.order, iteration), 1)
+    return jax.random.fold_in(jax.random.fold_in(keys.order, iteration), SELECTION)
 
 
 def member_keys(seed: int) -> Keys:

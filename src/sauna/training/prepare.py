@@ -150,7 +150,8 @@ def check_own_parts(config: Config, spaces: Spaces) -> None:
     Raises:
       BadInput: a part cannot be used.
     """
-    if any(":" in name for name in (config.network, config.filter, config.vex_target)):
+    names = ("network", "filter", "vex_target", "sampler", "loss_weight", "stop")
+    if any(":" in getattr(config, name) for name in names):
         configure_jax()
         from sauna.training.check_plugins import check_plugins
 

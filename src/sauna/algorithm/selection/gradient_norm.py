@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.scores import check_range, check_share
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -20,6 +21,9 @@ def gradient_norm(setup: SamplerSetup, uniform: float = 0.1, share: float = 1.0)
     summed over the components c of a factored action. The value loss draws rows of its own, by
     `|R - V|`. After Katharopoulos & Fleuret 2018.
     """
+
+    check_range("uniform", uniform, 0.0, 1.0)
+    check_share(share)
 
     def mixed(score: Array, present: Array) -> Array:
         score, even = score * present, present / jnp.sum(present)
