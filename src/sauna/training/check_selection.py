@@ -106,9 +106,7 @@ def _check_array(name: str, field: str, array: Any, shape: tuple[int, ...], is_m
     BadInput: the array is of another shape, or of another type than bool or floating-point.
     """
     kind = getattr(array, "dtype", None)
-    fits = kind is not None and (
-        kind == jnp.dtype(bool) if is_mask else jnp.issubdtype(kind, jnp.floating)
-    )
+    fits = kind is not None and jnp.issubdtype(kind, jnp.bool_ if is_mask else jnp.floating)
     if getattr(array, "shape", None) != shape or not fits:
         raise BadInput(
             f"{name} gives {field} of shape {getattr(array, 'shape', type(array).__name__)} and "
