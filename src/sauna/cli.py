@@ -14,11 +14,20 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
+from sauna.config.presets import (
+    ARM_HELP,
+    COMPARED,
+    CONTROL_HELP,
+    DECIDED,
+    PRESET_HELP,
+    RULE_HELP,
+    given_by,
+    parse_all,
+)
 from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
 
-LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
+LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
 
 
@@ -374,6 +383,11 @@ def _list(values: dict[str, Any]) -> None:
 
         for name in names_of(what):
             print(name)
+    elif what == "rules":
+        for name, text in {**RULE_HELP, **CONTROL_HELP}.items():
+            stage, _, sentence = text.partition(": ")
+            print(f"{name:15} {stage:8} {sentence}")
+        print("\nJoin rules by +, such as sauna+avec, and a control to a rule: gigaflow+random")
     elif what == "studies":
         from sauna.experiments.study.spec import built_in
 

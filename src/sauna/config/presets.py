@@ -151,11 +151,19 @@ ARM_HELP = {
     "pods": "rollout: the half of the 64-step segments whose advantages vary most",
     "vex-oracle": "rollout: keep where SAUNA's quantity, known afterwards, is high",
 }
+STAGES = ("collect", "rollout", "epoch", "loss", "stop", "critic")
+# What `sauna list rules` shows: `stage: sentence`.
+RULE_HELP = {
+    "sauna": "collect: keep a step if its predicted explained variance is informative (eq. 7)",
+    **{
+        name: text for name, text in ARM_HELP.items() if ": " in text and not name.startswith("ppo")
+    },
+}
 CONTROL_HELP = {
-    "random": "as many samples as the rule takes in each iteration, at random",
-    "stride": "as many, every k-th",
-    "low-advantage": "as many, those of smallest |advantage|",
-    "reversed": "as many, those that the rule wants least",
+    "random": "control: as many samples as the rule takes in each iteration, at random",
+    "stride": "control: as many, every k-th",
+    "low-advantage": "control: as many, those of smallest |advantage|",
+    "reversed": "control: as many, those that the rule wants least",
 }
 
 # The arms of a comparison where none are named; the first is the baseline.

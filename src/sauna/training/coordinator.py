@@ -250,10 +250,10 @@ class Coordinator:
             self._run.config.keep_checkpoints,
         )
 
-    def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, float]]) -> None:
+    def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> None:
         seconds = max(timing["seconds"] for timing in timings)
         steps = sum(timing["env_steps"] for timing in timings)
-        timing = {
+        timing: dict[str, Any] = {
             "iteration": self._iteration,
             "env_steps": steps,
             "seconds": seconds,
@@ -261,6 +261,12 @@ class Coordinator:
         }
         if all("collect_seconds" in timing for timing in timings):  # unknown on the device
             timing["collect_seconds"] = max(timing["collect_seconds"] for timing in timings)
+            timing["collect_cpu_seconds"] = sum(t["collect_cpu_seconds"] for t in timings)
+            timing["update_cpu_seconds"] = {
+                member: seconds
+                for t in timings
+                for member, seconds in t["update_cpu_seconds"].items()
+            }
         _append(self._run.path / "metrics.jsonl", rows)
         _append(self._run.path / "timing.jsonl", [timing])
         self._tensorboard.write(rows, timing)

@@ -60,9 +60,7 @@ class PipeReporter:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
             return max(self._granted - iteration, 0)
 
-    def iteration(
-        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
-    ) -> None:
+    def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         header = {"kind": "iteration", "iteration": iteration, "rows": rows, "timing": timing}
         send(self._outbox, header)
 

@@ -30,7 +30,7 @@ class Reporter(Protocol):
         """Waits until iteration `iteration` may start; how many may from there on. 0: stop."""
 
     def iteration(
-        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
+        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]
     ) -> None: ...
 
     def state(self, iteration: int, arrays: Arrays) -> None: ...
