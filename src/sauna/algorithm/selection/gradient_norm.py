@@ -70,7 +70,7 @@ def head_gradient(setup: SamplerSetup, policy: Array, action: Array, hidden: Arr
     total, start = jnp.zeros(len(hidden)), 0
     for c, size in enumerate(setup.action_sizes):
         pi = jax.nn.softmax(policy[:, start : start + size], -1)
-        taken = jnp.take_along_axis(pi, action[:, c : c + 1].astype(jnp.int32), -1)[:, 0]
-        total += 1.0 - 2.0 * taken + jnp.sum(pi**2, -1)
+        taken = jax.nn.one_hot(action[:, c].astype(jnp.int32), size)
+        total += jnp.sum((taken - pi) ** 2, -1)  # of squares: rounding makes no negative number
         start += size
     return jnp.sqrt(total * above)
