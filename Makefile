@@ -5,7 +5,7 @@
 # make test-newest  both with the newest versions of all packages, in .venv-newest
 # make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
 # make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
-# make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
+# make mutants   plants mistakes in algorithm/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
 # make cost   what checks and checkpoints take of a training
 # make lint   style, format and types

@@ -60,6 +60,11 @@ def test_rows_hold_every_metric(result) -> None:
         "vex_spread",
         "vex_median",
         "learning_rate",
+        "gradient_steps",
+        "sample_rate",
+        "samples_forward",
+        "samples_backward",
+        "effective_sample_size",
     }
     for row in result.metrics:
         assert set(row) == expected

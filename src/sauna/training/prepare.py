@@ -145,13 +145,15 @@ def _together(config: Config) -> bool:
 
 
 def check_own_parts(config: Config, spaces: Spaces) -> None:
-    """Looks at what of a run is the user's own: a mistake there is bad input.
+    """Looks at what of a run is the user's own, and at rules' arguments: a mistake is bad input.
 
     Raises:
       BadInput: a part cannot be used.
     """
     names = ("network", "filter", "vex_target", "sampler", "loss_weight", "stop")
-    if any(":" in getattr(config, name) for name in names):
+    numbers = ("sampler_kwargs", "loss_weight_kwargs", "stop_kwargs")
+    own = any(":" in getattr(config, name) for name in names)
+    if own or any(getattr(config, name) != "{}" for name in numbers) or config.control == "stride":
         configure_jax()
         from sauna.training.check_plugins import check_plugins
 
