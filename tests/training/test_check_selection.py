@@ -79,17 +79,8 @@ def test_a_mistake_is_one_line_before_the_run(settings: dict[str, Any], text: st
 
 
 def test_a_mistake_ends_with_2_and_creates_nothing(tmp_path) -> None:
-    command = [
-        "worlds:Scripted",
-        "--arm",
-        "ppo",
-        "--rollout-steps",
-        "16",
-        "--minibatches",
-        "4",
-        "--steps",
-        "64",
-    ]
+    settings = {"arm": "ppo", "rollout-steps": 16, "minibatches": 4, "steps": 64}
+    command = ["worlds:Scripted", *(f"--{name}={value}" for name, value in settings.items())]
     mistakes = (
         ["--sampler", "own_rules:too_short"],
         ["--sampler", "kondo", "--sampler-kwargs", '{"share": 7}'],
@@ -107,7 +98,7 @@ def test_a_mistake_ends_with_2_and_creates_nothing(tmp_path) -> None:
 
 
 def test_rules_train_by_name_and_by_value(tmp_path) -> None:
-    """A quarter of the rows: one minibatch of four per epoch. The sampler's Python number counts."""
+    """A quarter of the rows: minibatches of 2. The sampler's state is a Python number."""
     settings = {**SMALL, "arm": "ppo", "steps": 64, "selection_mode": "smaller"}
     found = sauna.train(
         "worlds:Scripted",
