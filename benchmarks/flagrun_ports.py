@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from sauna import rundir
-from sauna.envs.gymnasium import make_env
-from sauna.evaluation import choose_renderer
+from sauna.envs.make import make_env
+from sauna.experiments.evaluate.episodes import choose_renderer
+from sauna.system import run_directory
 
 ROOT = Path(__file__).parent.parent
 RESULT = ROOT / "results" / "flagrun_ports.json"
@@ -130,8 +130,8 @@ def train(name: str) -> dict[str, Any]:
 def measure() -> None:
     result = {
         "command": "python benchmarks/flagrun_ports.py --measure",
-        "machine": rundir.machine(),
-        "versions": {**rundir.versions(), **{name: version(name) for name in PORT}},
+        "machine": run_directory.machine(),
+        "versions": {**run_directory.versions(), **{name: version(name) for name in PORT}},
         "played": [play(name, policy) for name in ENVS for policy in POLICIES],
         "trained": [train(name) for name in ENVS],
     }

@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna import rundir
-from sauna.bench.rates import alternate, ratio, training_rate
-from sauna.bench.scale import draw
+from sauna.experiments.bench.rates import alternate, ratio, training_rate
+from sauna.experiments.bench.scale import draw
+from sauna.system import run_directory
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -66,8 +66,8 @@ def measure_filtered() -> None:
     rates = alternate(arms, rounds=5, say=print)
     result = {
         **common,
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
         "rates": rates,
         "of_ppo": {name: ratio(found, rates["ppo"]) for name, found in rates.items()},
     }

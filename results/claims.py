@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.study.numbers import interval
-from sauna.study.statistics import Estimate, compare, improvement_over_tasks
-from sauna.study.summary import MORE_STEPS, UNFILTERED
-from sauna.study.tables import PAPER, unversioned
+from sauna.experiments.report.numbers import interval
+from sauna.experiments.statistics import Estimate, compare, improvement_over_tasks
+from sauna.experiments.study.summary import MORE_STEPS, UNFILTERED
+from sauna.experiments.study.tables import PAPER, unversioned
 
 VARIANTS = ("sauna", "sauna 0.8", "sauna-paper")
 REFERENCES = ("sauna-reference", "sauna-reference, kept steps")
@@ -41,7 +41,9 @@ CLAIMS = (
         "Dropping steps causes the gain, not the head trained beside it (section 4.2, Fig. 3)",
         (("sauna", "vex-head"), ("sauna 0.8", "vex-head")),  # the paper's head has another target
     ),
-    Claim("The head helps even if nothing is dropped (asked in section 4.2)", (("vex-head", "ppo"),)),
+    Claim(
+        "The head helps even if nothing is dropped (asked in section 4.2)", (("vex-head", "ppo"),)
+    ),
     Claim(
         "The filter chooses better than a matched random control (not in the paper)",
         (("sauna 0.8", "random-drop"),),

@@ -1,4 +1,4 @@
-"""How often the intervals of `sauna.study.statistics` hold the truth: `results/intervals.json`.
+"""How often the intervals of `experiments/statistics.py` hold the truth: `results/intervals.json`.
 
     python results/intervals.py     (two minutes)
 
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from sauna.study.statistics import (
+from sauna.experiments.statistics import (
     bootstrap_improvement,
     improvement_estimate,
     iqm_estimate,

@@ -37,12 +37,12 @@ from pages import (
     sweep_page,
 )
 
-from sauna.study.figures import draw_plots, write_figures
-from sauna.study.page import rounded
-from sauna.study.results import gather
-from sauna.study.spec import load_spec
-from sauna.study.summary import summarize
-from sauna.study.units import units_of
+from sauna.experiments.report.figures import draw_plots, write_figures
+from sauna.experiments.report.page import rounded
+from sauna.experiments.study.results import gather
+from sauna.experiments.study.spec import load_spec
+from sauna.experiments.study.summary import summarize
+from sauna.experiments.study.units import units_of
 
 PAGES = ROOT / "docs" / "results"
 FIGURES = PAGES / "figures"

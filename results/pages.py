@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from claims import HEADER, Count, claims_rows, count, short_answer, told
 
-from sauna.study import dial, noise, torso
-from sauna.study.numbers import digits_of, digits_of_tasks, interval, number
-from sauna.study.spec import load_spec
-from sauna.study.statistics import ALPHA, holm
-from sauna.study.tables import PAPER, unversioned
+from sauna.experiments.measure import coverage_report, noise_report, posture_report
+from sauna.experiments.report.numbers import digits_of, digits_of_tasks, interval, number
+from sauna.experiments.statistics import ALPHA, holm
+from sauna.experiments.study.spec import load_spec
+from sauna.experiments.study.tables import PAPER, unversioned
 
 ROOT = Path(__file__).parent.parent
 STUDIES = ("fig3", "cheetah30", "release", "a2c", "minatar", "pong")
@@ -30,7 +30,7 @@ CLAIMED = {  # the studies that the claims are judged by, and how the summary ca
     "release": "tasks with the authors' settings",
     "minatar": "MinAtar games",
 }
-MEASURED = {"noise": noise, "dial": dial, "fig5": torso}
+MEASURED = {"noise": noise_report, "dial": coverage_report, "fig5": posture_report}
 FILES = {"dial": "threshold_sweep", "fig5": "posture"}  # a page's name where it is not the study's
 DECIDED = ("better", "worse")
 
@@ -330,9 +330,7 @@ def _decided(verdicts: list[dict[str, Any]]) -> str:
     return f"{head}\n\n{listed(decided)}" if decided else f"{head}\n\nNone is decided."
 
 
-def _of_task(
-    task: str, name: str, results: Mapping[str, Any], summary: Mapping[str, Any]
-) -> str:
+def _of_task(task: str, name: str, results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     """Every arm and every comparison of one task, folded."""
     verdicts = [v["text"] for v in summary["verdicts"] if v["task"] == task]
     controls = [v["text"] for v in summary["filtering"] if v["task"] == task]
@@ -345,9 +343,7 @@ def _of_task(
     return folded(f"{task}: all arms and comparisons", "\n\n".join(parts))
 
 
-def arms_table(
-    task: str, name: str, results: Mapping[str, Any], summary: Mapping[str, Any]
-) -> str:
+def arms_table(task: str, name: str, results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     """Every arm of one task, the paper's numbers beside it."""
     wanted = {arm.label: len(arm.seeds) for arm in load_spec(name).arms}
     digits = digits_of_tasks(summary["table"])[task]
@@ -467,7 +463,7 @@ def noise_page(measured: Mapping[str, Any]) -> str:
     """Signal and noise of the policy gradient, kept against dropped against random."""
     rows = [["Task", "Arm", "Keep rate", "Variance of dropped steps, control = 1",
              "Signal to noise, dropped - control", "By variance", "By signal to noise"]]  # fmt: skip
-    full = noise.text_table(measured)
+    full = noise_report.text_table(measured)
     for row in full[1:]:
         by_variance, by_signal = _noise_kinds(row)
         rows.append([row[0], shown_label(row[1]), row[3], row[14], row[7], by_variance, by_signal])
@@ -537,7 +533,7 @@ def _kind(text: str, equal: float, words: tuple[str, str]) -> str:
 
 
 def noise_answer(measured: Mapping[str, Any]) -> str:
-    kinds = [_noise_kinds(row) for row in noise.text_table(measured)[1:]]
+    kinds = [_noise_kinds(row) for row in noise_report.text_table(measured)[1:]]
     answers = []
     for place, name in ((0, "by variance"), (1, "by signal to noise")):
         found = [kind[place] for kind in kinds]
@@ -554,11 +550,11 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
     correlations = [["Task", "Entropy", "State coverage", "Final return", "Exploration rises"]]
     controls = [["Task", "Threshold", "Entropy", "State coverage", "Final return", "Pairs",
                  "Differs in"]]  # fmt: skip
-    for task in dial.tasks_of(measured):
-        marks = dial.marks(measured, task)
+    for task in coverage_report.tasks_of(measured):
+        marks = coverage_report.marks(measured, task)
         correlations.append([task, *_correlations(marks)])
         controls += [[task, *row] for row in _beside_controls(marks)]
-    arms = dial.text_table(measured)
+    arms = coverage_report.text_table(measured)
     arms[0] = ["Task", "Arm", "Members", "Threshold", "Keep rate", "Entropy", "State coverage",
                "Final return"]  # fmt: skip
     return joined((
@@ -585,7 +581,7 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
 
 
 def _correlations(marks: Any) -> list[str]:
-    found = {key: dial.correlation(marks, key) for key in dial.ASKED}
+    found = {key: coverage_report.correlation(marks, key) for key in coverage_report.ASKED}
     if any(value is None for value in found.values()):
         return ["-", "-", "-", "not decided"]
     p_values = dict(zip(found, holm([value[1] for value in found.values()]), strict=True))
@@ -594,7 +590,7 @@ def _correlations(marks: Any) -> list[str]:
         p = p_values[key]
         shown.append(f"{rho:.2f} (p {'< 0.001' if p < 0.001 else f'= {p:.3f}'})")
         signs[key] = int(np.sign(rho)) if p < ALPHA else 0
-    entropy, coverage = (signs[key] for key in dial.ASKED[:2])
+    entropy, coverage = (signs[key] for key in coverage_report.ASKED[:2])
     return [*shown, "yes" if entropy == coverage == 1 else "not decided"]
 
 
@@ -605,24 +601,24 @@ def _beside_controls(marks: Any) -> list[list[str]]:
         if control.drops_like not in arms:
             continue
         arm, shown, apart = arms[control.drops_like], [], []
-        for key, name in zip(dial.ASKED, ("entropy", "coverage", "return"), strict=True):
-            estimate = dial.beside_coin(arm, control, key)
-            shown.append(noise.shown(estimate))
+        for key, name in zip(coverage_report.ASKED, ("entropy", "coverage", "return"), strict=True):
+            estimate = coverage_report.beside_coin(arm, control, key)
+            shown.append(noise_report.shown(estimate))
             if estimate.low is not None and not estimate.low <= 0 <= estimate.high:
                 apart.append(name)
-        key = dial.ASKED[1]
+        key = coverage_report.ASKED[1]
         pairs = {s for s, _ in arm.members[key]} & {s for s, _ in control.members[key]}
         rows.append([arm.label, *shown, str(len(pairs)), ", ".join(apart) or "nothing decided"])
     return rows
 
 
 def sweep_answer(measured: Mapping[str, Any]) -> str:
-    tasks = dial.tasks_of(measured)
-    yes = [t for t in tasks if _correlations(dial.marks(measured, t))[-1] == "yes"]
+    tasks = coverage_report.tasks_of(measured)
+    yes = [t for t in tasks if _correlations(coverage_report.marks(measured, t))[-1] == "yes"]
     if not yes:
         return "**not decided**"
     answer = f"**yes on {len(yes)} of {len(tasks)}**, {_listed_and(yes)}"
-    rows = [row for task in yes for row in _beside_controls(dial.marks(measured, task))]
+    rows = [row for task in yes for row in _beside_controls(coverage_report.marks(measured, task))]
     if rows and all("coverage" not in row[-1] and "entropy" not in row[-1] for row in rows):
         answer += "; no difference from a matched random control is decided there"
     return answer
@@ -630,12 +626,12 @@ def sweep_answer(measured: Mapping[str, Any]) -> str:
 
 def posture_page(measured: Mapping[str, Any], stills: bool) -> str:
     """Shares of seeds that run on their feet."""
-    (_, *rows) = torso.text_table(measured)
+    (_, *rows) = posture_report.text_table(measured)
     head = ["Arm", "Seeds", "On its feet [95%]", "Between", "Return on its feet",
             "Return on its back"]  # fmt: skip
     pairs = [["Arm", "Against", "Pairs", "Only the arm on its feet", "Only the other", "p"]]
     pairs += [[pair.label, pair.baseline, str(pair.seeds), str(pair.gained), str(pair.lost),
-               f"{pair.p:.3f}"] for pair in torso.pairs(measured) if pair.seeds]  # fmt: skip
+               f"{pair.p:.3f}"] for pair in posture_report.pairs(measured) if pair.seeds]  # fmt: skip
     return joined((
         f"# {TITLES['fig5']}",
         WHY["fig5"],
@@ -654,8 +650,8 @@ def posture_page(measured: Mapping[str, Any], stills: bool) -> str:
 
 
 def posture_answer(measured: Mapping[str, Any]) -> str:
-    feet = {cell["label"]: torso.postures(cell) for cell in measured["cells"]}
-    pair = next(torso.pairs(measured), None)
+    feet = {cell["label"]: posture_report.postures(cell) for cell in measured["cells"]}
+    pair = next(posture_report.pairs(measured), None)
     if pair is None:
         return "**not decided**"
     counts = [f"{sum(one.on_feet for one in feet[label])} of {len(feet[label])} seeds ({label})"

@@ -21,10 +21,10 @@ from typing import Any
 
 from make import CURVES, ROOT, STUDIES, load
 
-from sauna import rundir
-from sauna.study.process import Message, UnitProcess
-from sauna.study.results import DIGITS
-from sauna.study.spec import Arm, load_spec
+from sauna.experiments.study.execute.process import Message, UnitProcess
+from sauna.experiments.study.results import DIGITS
+from sauna.experiments.study.spec import Arm, load_spec
+from sauna.system import run_directory
 
 PATH = ROOT / "results" / "revisions.json"
 SECONDS = 300.0  # within which a run has to get there
@@ -66,7 +66,9 @@ def again(arm: Arm, task: str, wanted: dict[int, int]) -> dict[int, dict[str, An
         done.wait(SECONDS)
         process.stop()
         process.end()
-        return {r["seed"]: r for r in rundir.rows(run) if r["env_steps"] == wanted[r["seed"]]}
+        return {
+            r["seed"]: r for r in run_directory.rows(run) if r["env_steps"] == wanted[r["seed"]]
+        }
 
 
 def is_equal(row: dict[str, Any] | None, curve: dict[str, list[Any]]) -> bool:
@@ -89,8 +91,8 @@ def main() -> None:
         found.append({"study": name, "arm": arm.label, "task": cell["task"], "revision": revision,
                       "env_steps": wanted, "equal": equal})  # fmt: skip
         print(found[-1], flush=True)
-    result = {"command": "python results/revisions.py", "now": shown(rundir.git_revision() or ""),
-              "runs": found}  # fmt: skip
+    now = shown(run_directory.git_revision() or "")
+    result = {"command": "python results/revisions.py", "now": now, "runs": found}
     PATH.write_text(json.dumps(result).replace('{"study"', '\n{"study"') + "\n")
     differ = [run for run in found if len(run["equal"]) < len(run["env_steps"])]
     if differ:

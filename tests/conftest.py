@@ -1,5 +1,5 @@
 """JAX as the product configures it, before any test imports it."""
 
-from sauna.worker import configure_jax
+from sauna.system.jax_setup import configure_jax
 
 configure_jax()

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from sauna.config import Config
-from sauna.core.population import Program, make_program
-from sauna.member_state import flat_params
-from sauna.placement import look_at, placed
-from sauna.presets import members, resolve
-from sauna.run import settle
-from sauna.training import Job, train_members
+from sauna.algorithm.rollout.program import Program, make_program
+from sauna.config.presets import members, resolve
+from sauna.config.settings import Config
+from sauna.training.loop.job import Job
+from sauna.training.loop.member_state import flat_params
+from sauna.training.prepare import look_at, placed, settle
+from sauna.training.worker import train_members
 
 SMALL = {
     "rollout_steps": 32,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna import Filter, JaxEnv, Transition, VexTarget
-from sauna.core.population import member_keys
+from sauna.algorithm.types import member_keys
 
 LENGTH = 12
 

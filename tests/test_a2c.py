@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 
 from helpers import Recorder, configured, equal, make_job, own, resumed, train_here
-from sauna.checkpoint import BadCheckpoint
-from sauna.config import FIELDS
-from sauna.core import a2c
-from sauna.core.batch import make_batch
-from sauna.core.policy import make_policy, score
-from sauna.core.types import Batch
-from sauna.core.update import init_state, minibatch_losses, update
-from sauna.errors import BadInput
-from sauna.member_state import named_optimizer, unpack_optimizer
-from sauna.presets import PRESET_HELP, PRESETS, resolve, stored_config
-from sauna.selection.vex import TARGETS
-from sauna.spaces import Spaces
-from sauna.study.command import comparison
-from sauna.study.spec import check, load_spec
-from sauna.training import train_members
+from sauna.algorithm.learner import a2c
+from sauna.algorithm.learner.samples import make_batch
+from sauna.algorithm.learner.update import init_state, minibatch_losses, update
+from sauna.algorithm.learner.vex_targets import TARGETS
+from sauna.algorithm.policy.policy import make_policy, score
+from sauna.algorithm.types import Batch
+from sauna.config.presets import PRESET_HELP, PRESETS, resolve, stored_config
+from sauna.config.settings import FIELDS
+from sauna.envs.spaces import Spaces
+from sauna.experiments.study.command import comparison
+from sauna.experiments.study.spec import check, load_spec
+from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.errors import BadInput
+from sauna.training.loop.member_state import named_optimizer, unpack_optimizer
+from sauna.training.worker import train_members
 from test_advantages import random_rollout
 from test_losses import hypers, random_batch
 

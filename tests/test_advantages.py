@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import configured
-from sauna.core.advantages import gae
-from sauna.core.batch import advantages_over_all, make_batch
-from sauna.core.types import Hypers, Rollout
-from sauna.selection.vex import TARGETS
+from sauna.algorithm.learner.advantages import gae
+from sauna.algorithm.learner.samples import advantages_over_all, make_batch
+from sauna.algorithm.learner.vex_targets import TARGETS
+from sauna.algorithm.types import Hypers, Rollout
 
 
 def hypers(**values: float) -> Hypers:

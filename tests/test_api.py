@@ -15,11 +15,11 @@ import pytest
 
 import sauna
 from helpers import SMALL, own
-from sauna import rundir
-from sauna.artifact import load_artifact
-from sauna.errors import BadInput
-from sauna.metrics.curve import interval, member_curves
-from sauna.trained import TrainedPolicy
+from sauna.experiments.evaluate.artifact import load_artifact
+from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.report.curve import interval, member_curves
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
@@ -43,7 +43,7 @@ def test_rows_hold_every_metric(result) -> None:
     for row in result.metrics:
         assert set(row) == expected
         assert all(math.isfinite(v) for v in row.values() if isinstance(v, float))
-    timing = rundir.rows(result.path, "timing.jsonl")
+    timing = run_directory.rows(result.path, "timing.jsonl")
     assert [row["iteration"] for row in timing] == sorted({r["iteration"] for r in result.metrics})
     total = sum(row["env_steps"] for row in timing)
     assert total == sum(row["env_steps"] for row in result.summary.values())
@@ -51,7 +51,7 @@ def test_rows_hold_every_metric(result) -> None:
 
 
 def test_config_json_says_everything(result) -> None:
-    stored = rundir.read_config(result.path)
+    stored = run_directory.read_config(result.path)
     assert stored["config"]["network"] == "mlp"
     assert {"jax", "gymnasium", "numpy", "sauna-rl"} <= set(stored["versions"])
     assert stored["machine"]["cores"] and stored["exact_resume"] is True
@@ -117,7 +117,7 @@ def test_tensorboard_holds_the_same_numbers(result) -> None:
 
 def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
     named = sauna.train(Scripted, quiet=True, out=tmp_path / "named", **SMALL)
-    assert rundir.read_config(named.path)["config"]["env"] == "worlds:Scripted"
+    assert run_directory.read_config(named.path)["config"]["env"] == "worlds:Scripted"
     local = sauna.train(lambda: Scripted(), quiet=True, out=tmp_path / "local", **SMALL)
     assert local.metrics == named.metrics
 
@@ -157,7 +157,7 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     done = subprocess.run([sys.executable, "-m", "sauna", *arguments], cwd=tmp_path,
                           capture_output=True, text=True)  # fmt: skip
     assert done.returncode == 0, done.stderr
-    rates = [row["keep_rate"] for row in rundir.rows(tmp_path / "run")]
+    rates = [row["keep_rate"] for row in run_directory.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
     command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-pictures"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
@@ -209,7 +209,7 @@ def test_curves_and_their_interval() -> None:
 
 @pytest.mark.slow
 def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
-    from sauna.metrics import display
+    from sauna.training import display
 
     monkeypatch.setattr(display.sys.stdout, "isatty", lambda: True, raising=False)
     shown = display.make_display()
@@ -217,7 +217,7 @@ def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
     sauna_run = sauna.api.runs.start(
         {"env": "worlds:Finite", "out": str(tmp_path / "run"), **SMALL}, shown
     )
-    sauna.api.runs.train(sauna_run, shown, resume=False)
+    sauna.api.train_and_draw(sauna_run, shown, resume=False)
     text = capsys.readouterr().out
     for word in ("sauna/0", "env steps", "keep rate", "Vex mean", "Vex spread"):
         assert word in text

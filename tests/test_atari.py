@@ -15,17 +15,16 @@ from ale_py import roms
 from ale_py.vector_env import AtariVectorEnv
 
 from helpers import equal, make_job, resumed, train_here
-from sauna.collect.host import HostCollector
-from sauna.core.population import make_program, member_keys
-from sauna.core.types import Hypers
-from sauna.envs.atari import AtariEnv, AtariEnvs, game_of
-from sauna.envs.backend import in_process_envs
-from sauna.envs.contract import HostEnvs, episode_seed
-from sauna.envs.gymnasium import env_maker, make_env
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import Hypers, member_keys
+from sauna.envs.host.atari_envs import AtariEnv, AtariEnvs, game_of
+from sauna.envs.host.contract import HostEnvs, episode_seed
+from sauna.envs.make import env_maker, in_process_envs, make_env
 from sauna.envs.probe import probe
 from sauna.envs.workers import ProcessEnvs
-from sauna.errors import BadInput
-from sauna.training import make_envs
+from sauna.system.errors import BadInput
+from sauna.training.loop.host import make_envs
 from test_envs import assert_same_step
 
 BREAKOUT = "ALE/Breakout-v5"

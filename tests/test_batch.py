@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 
 from helpers import configured
-from sauna.core.batch import advantages_over_all, make_batch
-from sauna.core.losses import combine
-from sauna.core.policy import make_policy
-from sauna.core.population import Keys, make_program, member_keys, minibatch_order
-from sauna.core.types import Hypers, Rollout
-from sauna.core.update import head_statistics, minibatch_losses
-from sauna.selection.filters import decide, empty_history, informative, random_drop, sauna_per_env
-from sauna.selection.vex import TARGETS
-from sauna.spaces import Spaces
+from sauna.algorithm.learner.metrics import head_statistics
+from sauna.algorithm.learner.ppo import combine
+from sauna.algorithm.learner.samples import advantages_over_all, make_batch
+from sauna.algorithm.learner.update import minibatch_losses, minibatch_order
+from sauna.algorithm.learner.vex_targets import TARGETS
+from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.rollout.program import decide, make_program
+from sauna.algorithm.selection.history import empty_history
+from sauna.algorithm.selection.random_drop import random_drop
+from sauna.algorithm.selection.vex_filter import informative, sauna_per_env
+from sauna.algorithm.types import Hypers, Keys, Rollout, member_keys
+from sauna.envs.spaces import Spaces
 from test_advantages import random_rollout
 from test_losses import hypers, random_batch
 

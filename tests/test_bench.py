@@ -8,10 +8,10 @@ import time
 import pytest
 
 from sauna import cli
-from sauna.bench import command, scale
-from sauna.bench.rates import Clock, alternate, physics_rate, ratio, simulator
-from sauna.bench.split import SECTIONS, Timers, split
-from sauna.presets import resolve
+from sauna.config.presets import resolve
+from sauna.experiments.bench import command, scale
+from sauna.experiments.bench.rates import Clock, alternate, physics_rate, ratio, simulator
+from sauna.experiments.bench.split import SECTIONS, Timers, split
 
 
 def test_the_rate_leaves_out_the_warm_up() -> None:

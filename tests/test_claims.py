@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from claims import CLAIMS, HEADER, claims_rows, told
 
-from sauna.study.tables import PAPER
+from sauna.experiments.study.tables import PAPER
 
 LOW, HIGH = np.arange(6.0), np.arange(6.0) + 10
 TASKS = ("A-v5", "B-v5", "C-v5")

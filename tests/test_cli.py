@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from helpers import SMALL, environment
-from sauna import cli, rundir
-from sauna.config import FIELDS, flag, parse, to_json
-from sauna.errors import BadInput
-from sauna.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
+from sauna import cli
+from sauna.config.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
+from sauna.config.settings import FIELDS, flag, parse, to_json
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
 
 WORLD = "worlds:Scripted"
 
@@ -162,8 +163,8 @@ def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> 
     other = tmp_path / "other"
     config = str(first / "config.json")
     assert sauna("train", "--config", config, "--out", str(other), "--seeds", "4,").returncode == 0
-    rows = rundir.rows(other)
-    assert rows == [row for row in rundir.rows(first) if row["seed"] == 4]
+    rows = run_directory.rows(other)
+    assert rows == [row for row in run_directory.rows(first) if row["seed"] == 4]
 
 
 def test_processes_that_the_machine_decided_are_not_repeated() -> None:
@@ -301,12 +302,12 @@ def test_random_drop_repeats_the_rates_of_a_run(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     for seed in (0, 1):
         rates = [
-            np.mean([row["keep_rate"] for row in rundir.rows(run)
+            np.mean([row["keep_rate"] for row in run_directory.rows(run)
                      if row["seed"] == seed and row["arm"] != "ppo"])
             for run in (source, control)
         ]  # fmt: skip
         assert rates[0] < 0.9 and abs(rates[0] - rates[1]) < 0.05
-    stored = rundir.read_config(control)["drop_rates"]
+    stored = run_directory.read_config(control)["drop_rates"]
     assert len(stored) == 2 and all(0 < rate < 1 for rates in stored for rate in rates[1:])
     done = sauna("train", WORLD, "--out", str(tmp_path / "x"), *small_flags(seeds="5,"), "--arm",
                  "random-drop", "--drop-rate-from", str(source))  # fmt: skip

@@ -21,9 +21,9 @@ from typing import Any
 import pytest
 
 from sauna import cli
-from sauna.study import mirror
-from sauna.study.node import Hub
-from sauna.study.tables import settings
+from sauna.experiments.study.execute import ray_files
+from sauna.experiments.study.execute.ray_node import Hub
+from sauna.experiments.study.tables import settings
 
 TESTS = str(Path(__file__).parent)
 MARK = "SAUNA_TEST_CLUSTER"  # in the environment of every process that a test starts
@@ -94,7 +94,7 @@ def test_a_report_names_every_machine() -> None:
 
 def test_what_runs_on_nodes_imports_neither_jax_nor_environments() -> None:
     code = (
-        "import sys, sauna.study.node; "
+        "import sys, sauna.experiments.study.execute.ray_node; "
         "sys.exit(any(name in sys.modules for name in ('jax', 'gymnasium', 'ray')))"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -126,11 +126,11 @@ def test_a_task_that_was_replaced_is_not_listened_to() -> None:
 
 
 def put(place: Path, files: dict[str, str]) -> None:
-    mirror.write(place, {name: text.encode() for name, text in files.items()})
+    ray_files.write(place, {name: text.encode() for name, text in files.items()})
 
 
 def all_of(place: Path) -> dict[str, bytes]:
-    return mirror.read(place, mirror.names(place))
+    return ray_files.read(place, ray_files.names(place))
 
 
 def test_files_arrive_as_they_are(tmp_path) -> None:
@@ -138,15 +138,15 @@ def test_files_arrive_as_they_are(tmp_path) -> None:
     put(here, {"run/config.json": "{}", "run/metrics.jsonl": "1\n", "run/.lock": "7",
                "run/checkpoints/00000010/state.safetensors": "x" * 9,
                "run/checkpoints/.writing-00000020/state.safetensors": "y"})  # fmt: skip
-    mirror.write(there, all_of(here))
-    tracker = mirror.Tracker(there)  # knows what it was given
+    ray_files.write(there, all_of(here))
+    tracker = ray_files.Tracker(there)  # knows what it was given
     put(there, {"run/metrics.jsonl": "1\n2\n", "stderr.txt": "warning"})
     put(there, {"run/checkpoints/00000020/state.safetensors": "z",
                 "run/checkpoints/00000020/manifest.json": "{}"})  # fmt: skip
     first = tracker.changes()
     assert sorted(first.files) == ["run/checkpoints/00000020/manifest.json",
                                    "run/checkpoints/00000020/state.safetensors"]  # fmt: skip
-    mirror.apply(here, first)
+    ray_files.apply(here, first)
     assert all_of(here) == all_of(there)
 
     with (there / "run/metrics.jsonl").open("a") as log:
@@ -155,7 +155,7 @@ def test_files_arrive_as_they_are(tmp_path) -> None:
     put(there, {"run/summary.json": "{}"})
     second = tracker.changes()
     assert ("run/metrics.jsonl", 4, b"3\n") in second.logs
-    mirror.apply(here, second)
+    ray_files.apply(here, second)
     assert all_of(here) == all_of(there)
     assert tracker.changes().files == {}
 
@@ -164,17 +164,17 @@ def test_a_log_that_was_cut_back_is_replaced_as_a_whole(tmp_path) -> None:
     """A resumed run cuts its logs back to the checkpoint, and goes on with other times."""
     here, there = tmp_path / "here", tmp_path / "there"
     put(here, {"run/timing.jsonl": "1\n2\n3\n"})
-    mirror.write(there, all_of(here))
-    tracker = mirror.Tracker(there)
+    ray_files.write(there, all_of(here))
+    tracker = ray_files.Tracker(there)
     put(there, {"run/timing.jsonl": "1\n5\n6\n7\n"})
-    mirror.apply(here, tracker.changes())
+    ray_files.apply(here, tracker.changes())
     assert all_of(here) == all_of(there)
 
 
 def test_a_checkpoint_never_counts_on_more_than_has_arrived(tmp_path, monkeypatch) -> None:
     """Interrupted anywhere while arriving, the newest checkpoint has its logs and both files."""
     here, there = tmp_path / "here", tmp_path / "there"
-    tracker = mirror.Tracker(there)
+    tracker = ray_files.Tracker(there)
     put(there, {"run/metrics.jsonl": "1\n2\n", "run/summary.json": "{}", "run/config.json": "{}"})
     put(
         there,
@@ -189,13 +189,13 @@ def test_a_checkpoint_never_counts_on_more_than_has_arrived(tmp_path, monkeypatc
         left[0] -= 1
         path.write_bytes(data)
 
-    monkeypatch.setattr(mirror.rundir, "write_durably", failing)
+    monkeypatch.setattr(ray_files.rundir, "write_durably", failing)
     for writes in range(5):
         shutil.rmtree(here, ignore_errors=True)
         left[0] = writes
         with pytest.raises(OSError):
-            mirror.apply(here, changes)
-        if mirror.checkpoints(here):
+            ray_files.apply(here, changes)
+        if ray_files.checkpoints(here):
             assert (here / "run/metrics.jsonl").read_text() == "1\n2\n"
             assert len(list((here / "run/checkpoints/00000002").iterdir())) == 2
         assert not (here / "run/summary.json").exists()

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import make_job, train_here
-from sauna.collect.moments import ObservationMoments
-from sauna.core.normalize import (
+from sauna.algorithm.policy.normalize import (
     Moments,
     initial_moments,
     moments_after_each,
@@ -15,6 +14,7 @@ from sauna.core.normalize import (
     scale_rewards,
     update_moments,
 )
+from sauna.algorithm.rollout.moments import ObservationMoments
 from test_reference import RunningNormalizer
 
 

@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 
 from helpers import make_job
-from sauna.collect import actor, moments
-from sauna.collect.host import HostCollector
-from sauna.core.population import make_program, member_keys, minibatch_order
-from sauna.envs import mujoco, mujoco_tasks
-from sauna.member_state import Counters
-from sauna.training import _hypers, _learn, _limit, make_envs
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout import actor, moments
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import member_keys
+from sauna.envs.host import mujoco_envs, mujoco_tasks
+from sauna.training.loop.budget import hypers_of, step_limit
+from sauna.training.loop.host import _learn, make_envs
+from sauna.training.loop.member_state import Counters
 
 STEPS, MEMBERS = 32, 3
 FUNCTIONS = ("draw", "act", "score", "value", "decide", "make_batch", "learn")
@@ -55,9 +58,9 @@ class Trainer:
 
     def collect(self, iteration: int) -> list:
         job = self.job
-        hypers = [_hypers(job, p, self.done[p], iteration)._replace(**self.changed)
+        hypers = [hypers_of(job, p, self.done[p], iteration)._replace(**self.changed)
                   for p in range(MEMBERS)]  # fmt: skip
-        limit = np.array([_limit(job.config, c) for c in self.done])
+        limit = np.array([step_limit(job.config, c) for c in self.done])
         params = np.stack([np.asarray(state.params) for state in self.states])
         return [self.collector.collect(params, hypers, iteration, limit), hypers]
 
@@ -98,7 +101,7 @@ def test_nothing_is_compiled_after_the_first_iteration(arm: str) -> None:
     trainer = Trainer("InvertedPendulum-v5", arm=arm, rollout_steps=256, **settings)
     trainer.iterate(0)
     trainer.changed = {"threshold": np.float32(1.0)}
-    loops = [actor._act, moments._see_and_normalize, mujoco._record, mujoco_tasks._advance]
+    loops = [actor._act, moments._see_and_normalize, mujoco_envs._record, mujoco_tasks._advance]
     variants = [len(loop.signatures) for loop in loops]
     compiled: list[str] = []
     listen = jax.monitoring.register_event_duration_secs_listener

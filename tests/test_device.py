@@ -12,17 +12,17 @@ import pytest
 
 from helpers import SMALL, Recorder, equal, make_job, own, resumed, train_here
 from jax_worlds import LENGTH, walk
-from sauna.collect.collected import capacity
-from sauna.collect.device import Collecting, collect, start
-from sauna.collect.host import HostCollector
-from sauna.core.population import make_program, member_keys
-from sauna.core.types import Hypers
-from sauna.device_program import MOST_PER_CALL
-from sauna.envs.contract import HostEnvs, Step
-from sauna.envs.gymnasium import EnvironmentFailure
-from sauna.envs.jax_env import advance, begin, flat
-from sauna.errors import BadInput
-from sauna.training import NonFinite
+from sauna.algorithm.rollout.collected import capacity
+from sauna.algorithm.rollout.device import Collecting, collect, start
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import Hypers, member_keys
+from sauna.envs.device.contract import advance, begin, flat
+from sauna.envs.host.contract import HostEnvs, Step
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
+from sauna.system.errors import BadInput
+from sauna.training.loop.device_program import MOST_PER_CALL
+from sauna.training.loop.job import NonFinite
 
 N = 3
 
@@ -173,7 +173,7 @@ def test_results_do_not_depend_on_how_many_iterations_a_call_runs() -> None:
             return 1
 
     single = OneByOne()
-    from sauna.training import train_members
+    from sauna.training.worker import train_members
 
     train_members(device_job(), single)
     assert equal(whole.final, single.final)
@@ -264,10 +264,10 @@ def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
 def test_bad_input_is_refused(
     settings: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sauna import placement, run
-    from sauna.metrics.display import PlainDisplay
+    from sauna.training import prepare, run
+    from sauna.training.display import PlainDisplay
 
-    monkeypatch.setattr(placement, "has_gpu", lambda: False)
+    monkeypatch.setattr(prepare, "has_gpu", lambda: False)
     with pytest.raises(BadInput, match=message):
         run.start({**SMALL, **settings}, PlainDisplay())
 

@@ -13,10 +13,11 @@ import pytest
 
 import sauna
 from helpers import SMALL
-from sauna import placement, rundir
-from sauna.device_program import make_mesh
-from sauna.errors import BadInput
-from sauna.machines import Place, read_place
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
+from sauna.training import prepare
+from sauna.training.loop.device_program import make_mesh
+from sauna.training.loop.multihost import Place, read_place
 
 SETTINGS = ["jax_worlds:walk", "--arm", "sauna", "--threshold", "0.9", "--envs", "8",
             "--rollout-steps", "32", "--minibatches", "4", "--epochs", "2", "--hidden", "8,8",
@@ -55,7 +56,9 @@ def assert_same_training(ours: list[dict[str, Any]], theirs: list[dict[str, Any]
 def test_eight_devices_give_what_one_gives(tmp_path: Path) -> None:
     finished(start(tmp_path / "one", "--seeds", "2", "--processes", "1"))
     finished(start(tmp_path / "eight", "--seeds", "2", "--devices", "8"))
-    assert_same_training(rundir.rows(tmp_path / "one"), rundir.rows(tmp_path / "eight"))
+    assert_same_training(
+        run_directory.rows(tmp_path / "one"), run_directory.rows(tmp_path / "eight")
+    )
 
 
 @pytest.mark.slow
@@ -67,7 +70,9 @@ def test_two_machines_train_one_member_together(tmp_path: Path) -> None:
     assert "compiled in" in told
     assert not (tmp_path / "none").exists(), "machine 0 alone writes"
     finished(start(tmp_path / "one"))
-    assert_same_training(rundir.rows(tmp_path / "one"), rundir.rows(tmp_path / "both"))
+    assert_same_training(
+        run_directory.rows(tmp_path / "one"), run_directory.rows(tmp_path / "both")
+    )
 
 
 @pytest.mark.slow
@@ -122,9 +127,9 @@ def test_a_gpu_that_is_hidden_is_not_used(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(placement.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(placement.Path, "exists", lambda path: "nvidia" in str(path))
-    assert placement.has_gpu() == usable
+    monkeypatch.setattr(prepare.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(prepare.Path, "exists", lambda path: "nvidia" in str(path))
+    assert prepare.has_gpu() == usable
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,19 @@ import numpy as np
 import pytest
 
 from helpers import environment
-from sauna.errors import BadInput
-from sauna.measure.coverage import particle_entropy
-from sauna.study.dial import correlation, extra, marks, text_table, verdicts
-from sauna.study.measuring import ALONG, Item, gather_measured, items_of, scale_of
-from sauna.study.results import gather
-from sauna.study.spec import load_spec, read_spec
-from sauna.study.units import units_of
+from sauna.experiments.measure.coverage import particle_entropy
+from sauna.experiments.measure.coverage_report import (
+    correlation,
+    extra,
+    marks,
+    text_table,
+    verdicts,
+)
+from sauna.experiments.study.measuring import ALONG, Item, gather_measured, items_of, scale_of
+from sauna.experiments.study.results import gather
+from sauna.experiments.study.spec import load_spec, read_spec
+from sauna.experiments.study.units import units_of
+from sauna.system.errors import BadInput
 
 
 def test_coverage_is_the_entropy_of_what_is_known() -> None:

@@ -9,12 +9,13 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sauna.envs.contract import HostEnvs, Step, episode_seed
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker, make_drawn_env
+from sauna.envs.host.contract import HostEnvs, Step, episode_seed
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.make import env_maker, make_drawn_env
 from sauna.envs.probe import probe
+from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.envs.workers import ProcessEnvs
-from sauna.errors import BadInput
-from sauna.spaces import action_writer, describe, observation_reader
+from sauna.system.errors import BadInput
 from worlds import Scripted, Spaced
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]

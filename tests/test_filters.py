@@ -13,25 +13,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers import configured, equal, make_job, own, resumed, train_here
-from sauna.core.update import moved_threshold
-from sauna.errors import BadInput
-from sauna.member_state import Counters
-from sauna.selection import filters
-from sauna.selection.filters import (
-    Filter,
-    decide,
-    empty_history,
-    insert,
-    make_filter,
-    median,
-    random_drop,
+from sauna.algorithm.rollout.program import decide
+from sauna.algorithm.selection import vex_filter
+from sauna.algorithm.selection.history import empty_history, insert, median
+from sauna.algorithm.selection.random_drop import random_drop
+from sauna.algorithm.selection.registry import make_filter
+from sauna.algorithm.selection.vex_filter import (
+    moved_threshold,
     sauna_at_rate,
     sauna_joint,
     sauna_per_env,
-    scheduled,
     threshold_held,
 )
-from sauna.training import hypers_now
+from sauna.algorithm.types import Filter
+from sauna.system.errors import BadInput
+from sauna.training.loop.budget import hypers_now, scheduled
+from sauna.training.loop.member_state import Counters
 from test_losses import hypers
 
 
@@ -175,7 +172,7 @@ def loop_at_rate(vex: np.ndarray, rate: float, settle: int) -> np.ndarray:
 def test_a_held_keep_rate_equals_plain_python(rate: float) -> None:
     vex = np.random.default_rng(4).normal(0.5, 0.7, (90, 2)).astype(np.float32)
     got = run(sauna_at_rate(rate), vex)
-    expected = loop_at_rate(vex, rate, filters.SETTLE)
+    expected = loop_at_rate(vex, rate, vex_filter.SETTLE)
     assert (got != expected).mean() < 0.02  # float32 may round a level to the other rank
     assert got.all() == (rate == 1.0)
 

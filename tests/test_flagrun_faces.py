@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from sauna.envs.backend import in_process_envs
+from sauna.envs.device.contract import JaxEnv
 from sauna.envs.flagrun import ID
 from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.host import HumanoidFlagrunHarder
 from sauna.envs.flagrun.physics import anatomy, first_qpos, load_model, read_robot
-from sauna.envs.gymnasium import GymnasiumEnvs, env_maker
-from sauna.envs.jax_env import JaxEnv
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.envs.make import env_maker, in_process_envs
 from sauna.envs.probe import probe
-from sauna.errors import BadInput
+from sauna.system.errors import BadInput
 
 HOME = np.concatenate([[0, 0, 1.29, 1, 0, 0, 0], np.zeros(17)])  # upright, soles in the ground
 
@@ -167,9 +167,9 @@ def test_feet_touch_the_ground_that_they_stand_on() -> None:
 
 
 PICTURE = f"""
-from sauna.evaluation import choose_renderer
+from sauna.experiments.evaluate.episodes import choose_renderer
 choose_renderer()
-from sauna.envs.gymnasium import make_env
+from sauna.envs.host.gymnasium_envs import make_env
 env = make_env({ID!r}, {{}}, render_mode="rgb_array")
 env.reset(seed=0)
 picture = env.render()
@@ -190,8 +190,8 @@ def test_pictures_show_the_flag_and_the_cube() -> None:
 
 
 def test_the_host_face_needs_no_jax() -> None:
-    code = f"import sys; from sauna.envs.gymnasium import make_env; make_env({ID!r}, {{}})" \
-           "; assert 'jax' not in sys.modules"  # fmt: skip
+    made = f"import sys; from sauna.envs.make import make_env; make_env({ID!r}, {{}})"
+    code = made + "; assert 'jax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -18,14 +18,17 @@ import pytest
 import chromium
 import sauna
 from helpers import SMALL, configured, own
-from sauna.artifact import load_artifact
-from sauna.collect.collected import capacity
-from sauna.config import Config
-from sauna.core.batch import make_batch
-from sauna.core.types import Hypers, Rollout
-from sauna.errors import BadInput
-from sauna.inspection.decided import advantages, decide
-from sauna.inspection.examined import (
+from sauna.algorithm.learner.samples import make_batch
+from sauna.algorithm.learner.vex_targets import make_target
+from sauna.algorithm.rollout.collected import capacity
+from sauna.algorithm.rollout.program import decide as decide_stretch
+from sauna.algorithm.selection.registry import make_filter
+from sauna.algorithm.types import Hypers, Rollout
+from sauna.config.settings import Config
+from sauna.experiments.evaluate.artifact import load_artifact
+from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.inspect.decisions import advantages, decide
+from sauna.experiments.inspect.inspection import (
     Inspection,
     _stream,
     examine,
@@ -33,12 +36,9 @@ from sauna.inspection.examined import (
     principal_components,
     scaled,
 )
-from sauna.inspection.page import meaning
-from sauna.inspection.played import MOST, SIDE, Pictures, Recorder, _played
-from sauna.selection.filters import decide as decide_stretch
-from sauna.selection.filters import make_filter
-from sauna.selection.vex import make_target
-from sauna.trained import TrainedPolicy
+from sauna.experiments.inspect.page import meaning
+from sauna.experiments.inspect.recording import MOST, SIDE, Pictures, Recorder, _played
+from sauna.system.errors import BadInput
 from worlds import Drawn, Lives, Scripted
 
 THRESHOLD = 0.9

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from helpers import Recorder, make_job
-from sauna import rundir
-from sauna.envs.gymnasium import make_env
-from sauna.envs.jax_env import flat
-from sauna.envs.jax_native import make_jax_env
+from sauna.envs.device.contract import flat
+from sauna.envs.device.make import make_jax_env
+from sauna.envs.make import make_env
 from sauna.envs.probe import probe_on_device
-from sauna.errors import BadInput
-from sauna.training import train_members
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
+from sauna.training.worker import train_members
 
 slow = pytest.mark.slow
 # An environment of each backend, and how long its episodes may last here.
@@ -203,6 +203,6 @@ def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path)
     done = subprocess.run(command, env=variables, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "compiled in" in done.stdout
-    rows = rundir.rows(run)
+    rows = run_directory.rows(run)
     assert 32 < rows[-1]["env_steps"] <= 128
     assert all(np.isfinite(row["value_loss"]) for row in rows)

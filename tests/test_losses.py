@@ -9,13 +9,12 @@ import optax
 import pytest
 
 from helpers import configured
-from sauna.core.losses import combine, standardize, surrogate, value_error
-from sauna.core.policy import make_policy
-from sauna.core.population import minibatch_order
-from sauna.core.types import Batch, Hypers
-from sauna.core.update import init_state, minibatch_losses, update
-from sauna.selection.vex import TARGETS
-from sauna.spaces import Spaces
+from sauna.algorithm.learner.ppo import combine, standardize, surrogate, value_error
+from sauna.algorithm.learner.update import init_state, minibatch_losses, minibatch_order, update
+from sauna.algorithm.learner.vex_targets import TARGETS
+from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.types import Batch, Hypers
+from sauna.envs.spaces import Spaces
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 

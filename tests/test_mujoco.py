@@ -8,11 +8,11 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sauna.envs.backend import in_process_envs
-from sauna.envs.contract import episode_seed
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
-from sauna.envs.mujoco import MujocoEnvs
-from sauna.envs.mujoco_tasks import TASKS, Runner, Task, make_task
+from sauna.envs.host.contract import episode_seed
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.host.mujoco_envs import MujocoEnvs
+from sauna.envs.host.mujoco_tasks import TASKS, Runner, Task, make_task
+from sauna.envs.make import in_process_envs
 
 SEEDS = [(3, 0), (3, 1), (7, 0)]
 NAMES = sorted(
@@ -116,7 +116,7 @@ def test_non_finite_states_are_named(monkeypatch) -> None:
     def explode(*arguments: object) -> None:
         envs._task.qvel[1, 4] = np.nan
 
-    monkeypatch.setattr("sauna.envs.mujoco_tasks._advance", explode)
+    monkeypatch.setattr("sauna.envs.host.mujoco_tasks._advance", explode)
     with pytest.raises(
         EnvironmentFailure, match=r"1 of seed 3, episode 0, step 1: observation.12. is"
     ):
@@ -125,7 +125,7 @@ def test_non_finite_states_are_named(monkeypatch) -> None:
 
 
 def test_episodes_longer_than_the_first_room_for_actions(monkeypatch) -> None:
-    monkeypatch.setattr("sauna.envs.mujoco.ROOM", 8)
+    monkeypatch.setattr("sauna.envs.host.mujoco_envs.ROOM", 8)
     envs, again = (in_process_envs("Swimmer-v5", {}, SEEDS, "auto") for _ in range(2))
     actions = wide_actions(envs, 40, seed=3)
     envs.reset(), again.reset()
@@ -138,7 +138,7 @@ def test_episodes_longer_than_the_first_room_for_actions(monkeypatch) -> None:
 
 
 def test_room_is_made_when_another_episode_ends(monkeypatch) -> None:
-    monkeypatch.setattr("sauna.envs.mujoco.ROOM", 3)
+    monkeypatch.setattr("sauna.envs.host.mujoco_envs.ROOM", 3)
     envs = in_process_envs("InvertedPendulum-v5", {"max_episode_steps": 50}, SEEDS, "auto")
     envs.reset()
     every, action = np.ones(len(SEEDS), bool), np.zeros((len(SEEDS), 1), np.float32)
@@ -153,7 +153,7 @@ def test_room_is_made_when_another_episode_ends(monkeypatch) -> None:
 
 
 def test_without_mujocos_library_tasks_step_themselves(monkeypatch) -> None:
-    monkeypatch.setattr("sauna.envs.mujoco_tasks.physics_is_linked", lambda: False)
+    monkeypatch.setattr("sauna.envs.host.mujoco_tasks.physics_is_linked", lambda: False)
     envs = in_process_envs("Hopper-v5", {}, SEEDS, "auto")
     assert type(envs) is MujocoEnvs and type(envs._task) is Task
     envs.close()

@@ -13,14 +13,14 @@ import pytest
 from scipy import stats
 
 from helpers import configured, make_job, train_here
-from sauna.collect.actor import make_actor
-from sauna.core.convolutions import LAYERS, convolutions
-from sauna.core.distributions import bernoulli, gaussian, multi_categorical
-from sauna.core.networks import NatureCNN
-from sauna.core.policy import make_policy
-from sauna.errors import BadInput
-from sauna.member_state import flat_params, named_params
-from sauna.spaces import Spaces
+from sauna.algorithm.policy.convolutions import LAYERS, convolutions
+from sauna.algorithm.policy.distributions import bernoulli, gaussian, multi_categorical
+from sauna.algorithm.policy.networks import NatureCNN
+from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.rollout.actor import make_actor
+from sauna.envs.spaces import Spaces
+from sauna.system.errors import BadInput
+from sauna.training.loop.member_state import flat_params, named_params
 
 VECTOR = Spaces("vector", (11,), "continuous", (3,), "", "")
 IMAGE = Spaces("image", (40, 40, 2), "discrete", (3,), "", "")

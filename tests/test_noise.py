@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 
 from helpers import configured
-from sauna import measure, train
-from sauna.core.gradient import policy_gradient
-from sauna.core.normalize import Moments, normalize
-from sauna.core.policy import make_policy
-from sauna.core.update import minibatch_losses
-from sauna.errors import BadInput
-from sauna.measure import estimates, noise
-from sauna.measure.estimates import Gradients, estimate
-from sauna.measure.streams import (
+from sauna import train
+from sauna.algorithm.learner.update import minibatch_losses
+from sauna.algorithm.learner.vex_targets import TARGETS
+from sauna.algorithm.policy.normalize import Moments, normalize
+from sauna.algorithm.policy.policy import make_policy
+from sauna.experiments import measure
+from sauna.experiments.measure import estimates, noise
+from sauna.experiments.measure.estimates import Gradients, estimate
+from sauna.experiments.measure.gradient import policy_gradient
+from sauna.experiments.measure.noise_report import extra, over_members, text_table, verdicts
+from sauna.experiments.measure.streams import (
     Fresh,
     Standing,
     Stream,
@@ -28,9 +30,8 @@ from sauna.measure.streams import (
     load_standing,
     moved_in_time,
 )
-from sauna.selection.vex import TARGETS
-from sauna.study.noise import extra, over_members, text_table, verdicts
-from sauna.study.spec import read_spec
+from sauna.experiments.study.spec import read_spec
+from sauna.system.errors import BadInput
 from test_losses import VECTOR, hypers, random_batch
 
 PAIRS = (("dropped", "coin"),)

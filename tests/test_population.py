@@ -9,9 +9,9 @@ import pytest
 
 import sauna
 from helpers import SMALL, equal, make_job, own, train_here
-from sauna import checkpoint
-from sauna.errors import BadInput
-from sauna.presets import members, resolve
+from sauna.config.presets import members, resolve
+from sauna.system import checkpoint
+from sauna.system.errors import BadInput
 
 WORLD = "worlds:Scripted"
 ARMS = [("ppo", {}), ("sauna-reference", {"threshold": 0.6}),

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from helpers import configured
-from sauna import checkpoint
-from sauna.core.population import make_program, member_keys, minibatch_order
-from sauna.core.types import Hypers
-from sauna.spaces import Spaces
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import Hypers, member_keys
+from sauna.envs.spaces import Spaces
+from sauna.system import checkpoint
 from test_advantages import random_rollout
 
 CONFIG = configured(rollout_steps=40, envs=3, minibatches=4, epochs=2, hidden="5", arm="sauna")

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from helpers import make_job
-from sauna.collect.host import HostCollector
-from sauna.core.population import make_program, member_keys
-from sauna.envs.contract import episode_seed
-from sauna.envs.gymnasium import GymnasiumEnvs
-from sauna.member_state import Counters
-from sauna.training import _hypers, _limit
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import member_keys
+from sauna.envs.host.contract import episode_seed
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.training.loop.budget import hypers_of, step_limit
+from sauna.training.loop.member_state import Counters
 from worlds import Scripted
 
 T, N = 24, 2
@@ -158,10 +159,10 @@ class Setup:
         envs = GymnasiumEnvs(Scripted, [(3, n) for n in range(N)])
         self.collector = HostCollector(self.program, job.spaces, envs, [self.keys])
         self.collector.start()
-        self.hypers = _hypers(job, 0, Counters(), 0)
+        self.hypers = hypers_of(job, 0, Counters(), 0)
 
     def collect(self, iteration: int):
-        limit = np.array([_limit(self.config, Counters())])
+        limit = np.array([step_limit(self.config, Counters())])
         collected = self.collector.collect(
             np.asarray(self.params)[None], [self.hypers], iteration, limit
         )[0]

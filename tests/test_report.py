@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 import chromium
-from sauna import style
-from sauna.study import tables
-from sauna.study.figures import looks_of, plots_of
-from sauna.study.report import write_report
-from sauna.study.summary import summarize
+from sauna.experiments.report import style
+from sauna.experiments.report.figures import looks_of, plots_of
+from sauna.experiments.study import tables
+from sauna.experiments.study.report import write_report
+from sauna.experiments.study.summary import summarize
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$x$"
 ERROR = "NotFinite: the loss of <member> is nan\n  at iteration 3"

@@ -11,11 +11,12 @@ import pytest
 
 import sauna
 from helpers import SMALL, equal, make_job, resumed, train_here
-from sauna import checkpoint, presets, rundir
-from sauna import run as runs
-from sauna.errors import BadInput, SaunaError
-from sauna.measure.streams import load_standing
-from sauna.metrics.display import make_display
+from sauna.config import presets
+from sauna.experiments.measure.streams import load_standing
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput, SaunaError
+from sauna.training import run as runs
+from sauna.training.display import make_display
 from worlds import Scripted
 
 WORLD = "worlds:Scripted"
@@ -49,7 +50,7 @@ def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, c
     said = capsys.readouterr().out
     assert "does not repeat itself" in said and "not resumed exactly" in said
     assert said.index("does not repeat") < said.index("writing to")
-    assert rundir.read_config(run)["exact_resume"] is False
+    assert run_directory.read_config(run)["exact_resume"] is False
 
 
 def test_a_run_of_such_an_environment_goes_on_with_new_episodes(tmp_path, capsys) -> None:
@@ -59,7 +60,7 @@ def test_a_run_of_such_an_environment_goes_on_with_new_episodes(tmp_path, capsys
     make_incomplete(run, 2)
     sauna.resume(run)
     assert "every environment starts a new episode" in capsys.readouterr().out
-    assert [row["iteration"] for row in rundir.rows(run)] == [0, 1, 2, 3]
+    assert [row["iteration"] for row in run_directory.rows(run)] == [0, 1, 2, 3]
 
 
 def make_incomplete(run: Path, iteration: int) -> None:
@@ -143,7 +144,7 @@ def test_what_a_worker_finds_unusable_is_bad_input_and_leaves_nothing(
     def refuse(*given) -> None:
         raise BadInput("devices: 4 asked for, 1 are there")
 
-    monkeypatch.setattr("sauna.training.train_members", refuse)
+    monkeypatch.setattr("sauna.training.worker.train_members", refuse)
     with pytest.raises(BadInput, match="4 asked for"):
         sauna.train(lambda: Scripted(), out=tmp_path / "a" / "run", quiet=True, **SMALL)
     assert not (tmp_path / "a" / "run").exists()
@@ -160,8 +161,8 @@ def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) ->
     assert "can be resumed only from Python" in capsys.readouterr().out
     expected = (run / "metrics.jsonl").read_bytes()
     make_incomplete(run, 2)
-    stored = rundir.read_config(run)["config"]["env"]
-    delattr(sauna.local, stored.partition(":")[2])
+    stored = run_directory.read_config(run)["config"]["env"]
+    delattr(sauna.config.local, stored.partition(":")[2])
     with pytest.raises(BadInput, match="env: was passed by value; pass it again"):
         sauna.resume(run)
     sauna.resume(run, env=lambda: Scripted())
@@ -212,15 +213,15 @@ def test_where_too_many_rows_were_lost_it_is_said(tmp_path) -> None:
 def test_new_folders_are_flushed_into_those_that_were_there(tmp_path, monkeypatch) -> None:
     """Else a power cut could take a run with all of its checkpoints."""
     flushed: list[Path] = []
-    monkeypatch.setattr(rundir, "sync_folder", flushed.append)
-    rundir.create(tmp_path / "runs" / "first")
+    monkeypatch.setattr(run_directory, "sync_folder", flushed.append)
+    run_directory.create(tmp_path / "runs" / "first")
     assert flushed == [tmp_path / "runs", tmp_path]
 
 
 def test_rows_end_where_a_power_cut_has_spoilt_them_and_a_complete_run_says_so(tmp_path) -> None:
     log = tmp_path / "metrics.jsonl"
     log.write_bytes(b'{"a": 1}\n\0\0\0"b": 2}\n{"c": 3}\n{"d"')
-    assert rundir.rows(tmp_path) == [{"a": 1}]
-    rundir.write_json(tmp_path / "summary.json", {"complete": True})
+    assert run_directory.rows(tmp_path) == [{"a": 1}]
+    run_directory.write_json(tmp_path / "summary.json", {"complete": True})
     with pytest.raises(SaunaError, match=r"metrics\.jsonl: line 2 is damaged"):
-        rundir.rows(tmp_path)
+        run_directory.rows(tmp_path)

@@ -7,11 +7,11 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
-from sauna import rundir
-from sauna.study.schedule import Executor
-from sauna.study.spec import check, read_spec
-from sauna.study.units import Unit, units_of
-from sauna.study.view import DONE, FAILED, WAITING, Cell, StudyView
+from sauna.experiments.study.execute.display import DONE, FAILED, WAITING, Cell, StudyView
+from sauna.experiments.study.execute.executor import Executor
+from sauna.experiments.study.spec import check, read_spec
+from sauna.experiments.study.units import Unit, units_of
+from sauna.system import run_directory
 
 TWO = {"tasks": ["A-v0"], "seeds": 3, "steps": 10_000, "rollout_steps": 1000, "minibatches": 10,
        "arms": [{"label": "ppo"}, {"label": "sauna"}]}  # fmt: skip
@@ -36,7 +36,9 @@ class Broken(Executor):
                 self._left.remove(name)
             elif self.unlucky not in unit.seeds:
                 unit.run(self._folder).mkdir(parents=True)
-                rundir.write_json(unit.run(self._folder) / "summary.json", {"complete": True})
+                run_directory.write_json(
+                    unit.run(self._folder) / "summary.json", {"complete": True}
+                )
             self._end(name, "broken")
 
     def _tell_to_stop(self) -> None:
@@ -79,7 +81,7 @@ def test_a_coin_tries_again_with_its_source(tmp_path: Path, monkeypatch) -> None
     shutil.rmtree(places[0])
     monkeypatch.setattr(Broken, "unlucky", None)
     run(tmp_path, {**TWO, "arms": arms})
-    assert all(rundir.is_complete(place / "run") for place in places)
+    assert all(run_directory.is_complete(place / "run") for place in places)
     assert not list(tmp_path.rglob("failed.json"))
 
 
@@ -115,7 +117,7 @@ def test_a_mark_for_each_seed(tmp_path: Path, capsys) -> None:
 def test_the_rate_is_that_of_late(monkeypatch) -> None:
     """What came before a pause, and what is trained once more after a failure, is left out."""
     cell, now = Cell(check(read_spec(TWO).arms[0], "A-v0")), [0.0]
-    monkeypatch.setattr("sauna.study.view.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("sauna.experiments.study.execute.display.time.monotonic", lambda: now[0])
     cell.running.add("unit")
 
     def trained(at: float, steps: int) -> None:

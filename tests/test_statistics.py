@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sauna.study import statistics as s
+from sauna.experiments import statistics as s
 
 # The example of scipy's `mannwhitneyu` documentation: age at diagnosis, U = 17, exact p = 0.1111.
 MALES, FEMALES = np.array([19, 22, 16, 29, 24]), np.array([20, 11, 17, 12])

@@ -18,18 +18,18 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from helpers import SMALL, environment
-from sauna import rundir
 from sauna.api import compare
-from sauna.config import parse
-from sauna.errors import BadInput
-from sauna.presets import ARMS, COMPARED
-from sauna.spaces import describe
-from sauna.study.command import _check_measurable, compare_command, comparison
-from sauna.study.process import UnitProcess
-from sauna.study.results import _ended
-from sauna.study.spec import built_in, check, load_spec, read_spec
-from sauna.study.summary import summarize
-from sauna.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
+from sauna.config.presets import ARMS, COMPARED
+from sauna.config.settings import parse
+from sauna.envs.spaces import describe
+from sauna.experiments.study.command import _check_measurable, compare_command, comparison
+from sauna.experiments.study.execute.process import UnitProcess
+from sauna.experiments.study.results import _ended
+from sauna.experiments.study.spec import built_in, check, load_spec, read_spec
+from sauna.experiments.study.summary import summarize
+from sauna.experiments.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
 from test_cli import sauna, small_flags
 
 TWO = {"tasks": ["A-v0"], "seeds": 6, "arms": [{"label": "ppo"}, {"label": "sauna"}]}
@@ -267,7 +267,7 @@ def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) ->
 def test_random_drop_takes_the_rates_of_the_same_seeds(compared: Path) -> None:
     rates: dict[tuple[str, int], list[float]] = {}
     for path in (compared / "units").rglob("metrics.jsonl"):
-        for row in rundir.rows(path.parent):
+        for row in run_directory.rows(path.parent):
             rates.setdefault((row["arm"], row["seed"]), []).append(row["keep_rate"])
     for path in (compared / "units").glob("*random-drop*/run/config.json"):
         stored = json.loads(path.read_text())
@@ -346,7 +346,7 @@ def wait_for_units(out: Path) -> None:
     for path in (out / "units").rglob(".lock"):
         while True:
             try:
-                rundir.lock(path.parent).close()
+                run_directory.lock(path.parent).close()
                 break
             except BadInput:
                 assert time.monotonic() < deadline, f"{path} is still held"
@@ -383,13 +383,13 @@ def test_a_complete_run_counts_even_if_the_unit_was_split(tmp_path: Path) -> Non
     mark_split(unit, tmp_path)
     assert len(parts(unit, tmp_path)) == 3
     unit.run(tmp_path).mkdir()
-    rundir.write_json(unit.run(tmp_path) / "summary.json", {"complete": True})
+    run_directory.write_json(unit.run(tmp_path) / "summary.json", {"complete": True})
     assert parts(unit, tmp_path) == [unit]
 
 
 def test_a_second_study_in_the_same_place_is_refused(tmp_path: Path) -> None:
     (tmp_path / "units").mkdir()
-    with rundir.lock(tmp_path / "units"):
+    with run_directory.lock(tmp_path / "units"):
         done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
     assert done.returncode == 2 and "is in use by process" in done.stderr
     assert {path.name for path in tmp_path.rglob("*")} == {"units", ".lock"}
@@ -438,7 +438,9 @@ def test_a_study_without_any_result_exits_1(tmp_path: Path) -> None:
 
 def test_another_study_of_the_same_name_is_refused(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
-    rundir.write_json(tmp_path / "one" / "study.json", {"study": {"x": 1}, "seeds_per_unit": 3})
+    run_directory.write_json(
+        tmp_path / "one" / "study.json", {"study": {"x": 1}, "seeds_per_unit": 3}
+    )
     (tmp_path / "one.toml").write_text('tasks = ["CartPole-v1"]\n[[arms]]\nlabel = "ppo"\n')
     done = sauna("study", "one.toml", "--out", ".", cwd=tmp_path)
     assert done.returncode == 2 and "another study of this name" in done.stderr

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sauna.errors import BadInput
-from sauna.study import statistics as s
-from sauna.study.summary import summarize
+from sauna.experiments import statistics as s
+from sauna.experiments.study.summary import summarize
+from sauna.system.errors import BadInput
 
 STEPS = [1000, 2000, 3000]
 LOW = [1300.0, 1310.0, 1325.0, 1290.0, 1301.0, 1333.0]
@@ -339,5 +339,5 @@ def test_another_format_is_refused() -> None:
 
 
 def test_neither_module_loads_jax() -> None:
-    code = "import sys, sauna.study.summary; sys.exit('jax' in sys.modules)"
+    code = "import sys, sauna.experiments.study.summary; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

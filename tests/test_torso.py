@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sauna.errors import BadInput
-from sauna.measure.torso import SIDE, STILLS, clearest, pitch
-from sauna.study import torso
-from sauna.study.spec import load_spec, read_spec
-from sauna.study.units import seeds_per_unit, units_of
+from sauna.experiments.measure import posture_report
+from sauna.experiments.measure.posture import SIDE, STILLS, clearest, pitch
+from sauna.experiments.study.spec import load_spec, read_spec
+from sauna.experiments.study.units import seeds_per_unit, units_of
+from sauna.system.errors import BadInput
 from test_cli import sauna
 
 TORSO = {"name": "t", "measure": "torso", "tasks": ["HalfCheetah-v5"], "seeds": 6,
@@ -83,28 +83,28 @@ def test_shares_and_pairs_by_hand() -> None:
     base = [1.0] * 3 + [0.0] * 9 + [0.9] * 2 + [0.2] * 6
     own = [1.0] * 3 + [0.7] * 9 + [0.0] * 2 + [0.5] * 6
     found = measured(base, own, 20)
-    value, low, high = torso.share(torso.postures(found["cells"][0]))
+    value, low, high = posture_report.share(posture_report.postures(found["cells"][0]))
     z, n, p = 1.959964, 20, 5 / 20
     middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     np.testing.assert_allclose((value, low, high), (p, middle - half, middle + half), rtol=1e-6)
-    [pair] = torso.pairs(found)
+    [pair] = posture_report.pairs(found)
     assert pair[:5] == ("sauna", "ppo", 20, 9, 2)
     assert math.isclose(pair.p, 2 * (1 + 11 + 55) / 2**11)
-    said = torso.verdicts(found)
+    said = posture_report.verdicts(found)
     assert said[0] == "ppo: on its feet in 5 of 20 seeds (25% [11%, 47%])."
     assert "no evidence of a difference (20 pairs; only sauna on its feet in 9" in said[2]
 
 
 def test_a_difference_is_told_and_equal_ones_are_not() -> None:
-    [pair] = torso.pairs(measured([0.0] * 9, [1.0] * 9))
+    [pair] = posture_report.pairs(measured([0.0] * 9, [1.0] * 9))
     assert math.isclose(pair.p, 2 / 2**9)
-    assert "sauna against ppo, seed by seed: more seeds on their feet" in torso.verdicts(
+    assert "sauna against ppo, seed by seed: more seeds on their feet" in posture_report.verdicts(
         measured([0.0] * 9, [1.0] * 9))[2]  # fmt: skip
-    assert "fewer seeds on their feet" in torso.verdicts(measured([1.0] * 9, [0.0] * 9))[2]
+    assert "fewer seeds on their feet" in posture_report.verdicts(measured([1.0] * 9, [0.0] * 9))[2]
     same = [1.0, 0.0] * 5
-    assert next(iter(torso.pairs(measured(same, same)))).p == 1.0
-    assert next(iter(torso.pairs(measured(same, same[::-1])))).p == 1.0
+    assert next(iter(posture_report.pairs(measured(same, same)))).p == 1.0
+    assert next(iter(posture_report.pairs(measured(same, same[::-1])))).p == 1.0
 
 
 def test_the_episode_shown_is_in_the_members_posture() -> None:
@@ -113,27 +113,36 @@ def test_the_episode_shown_is_in_the_members_posture() -> None:
 
 
 def test_what_is_not_measured_yet_is_told() -> None:
-    assert torso.verdicts({"cells": []}) == ["No seed is trained to its end and measured yet."]
+    assert posture_report.verdicts({"cells": []}) == [
+        "No seed is trained to its end and measured yet."
+    ]
     alone = {"cells": [cell("ppo", [1.0, 0.0], None)]}
-    assert torso.verdicts(alone) == ["ppo: on its feet in 1 of 2 seeds, of 30 in all, "
+    assert posture_report.verdicts(alone) == ["ppo: on its feet in 1 of 2 seeds, of 30 in all, "
                                      "(50% [9%, 91%])."]  # fmt: skip
     part = measured([0.0, 0.0, 1.0], [1.0])
-    [pair] = torso.pairs(part)
+    [pair] = posture_report.pairs(part)
     assert (pair.seeds, pair.gained, pair.lost) == (1, 1, 0)
 
 
 def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
     found = measured([0.9, 0.8, 0.1, 0.1], [0.9, 0.1, 0.2, 0.9])
-    assert [one.seed for _, one in torso.shown_pair(found)] == [3, 3]
-    assert [one.seed for _, one in torso.shown_pair(measured([0.9, 0.1], [0.9, 0.1]))] == [0, 0]
+    assert [one.seed for _, one in posture_report.shown_pair(found)] == [3, 3]
+    assert [one.seed for _, one in posture_report.shown_pair(measured([0.9, 0.1], [0.9, 0.1]))] == [
+        0,
+        0,
+    ]
     (tmp_path / "torso").mkdir()
     for label, level in (("ppo", 0), ("sauna", 200)):
         strip = Image.new("RGB", (SIDE * len(STILLS), SIDE), (level, 50, 0))
         strip.save(tmp_path / "torso" / f"{label}-3.png")
-    assert torso.chosen(found) == ("Chosen for the contrast: the first seed of which only sauna is "
-                                   "on its feet (1 of 4; only ppo in 1).")  # fmt: skip
-    assert "failing that the first of all" in torso.chosen(measured([0.9, 0.1], [0.9, 0.1]))
-    extra = torso.extra(found, tmp_path)
+    assert posture_report.chosen(found) == (
+        "Chosen for the contrast: the first seed of which only sauna is on its feet "
+        "(1 of 4; only ppo in 1)."
+    )
+    assert "failing that the first of all" in posture_report.chosen(
+        measured([0.9, 0.1], [0.9, 0.1])
+    )
+    extra = posture_report.extra(found, tmp_path)
     assert "Chosen for the contrast" in extra.html and "Chosen" in extra.plots[0].caption
     picture = Image.open(tmp_path / "figures" / "stills.png")
     assert picture.width > picture.height
@@ -149,7 +158,7 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
     for one in found["cells"]:
         for member in one["members"]:
             member["points"][0] |= {"stills": [], "not_drawn": "no <display>"}
-    assert "<p>No stills: no &lt;display&gt;.</p>" in torso.extra(found, tmp_path).html
+    assert "<p>No stills: no &lt;display&gt;.</p>" in posture_report.extra(found, tmp_path).html
 
 
 @pytest.mark.slow

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sauna.core.batch import episode_numbers, kept_rows
-from sauna.core.update import head_statistics, variance_explained
-from sauna.selection.vex import TARGETS
+from sauna.algorithm.learner.metrics import head_statistics, variance_explained
+from sauna.algorithm.learner.samples import episode_numbers, kept_rows
+from sauna.algorithm.learner.vex_targets import TARGETS
 from test_advantages import random_rollout
 
 

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from sauna.envs.contract import episode_seed
+from sauna.envs.host.contract import episode_seed
 
 BOX = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 

@@ -25,20 +25,22 @@ from typing import Any, NamedTuple
 import jax
 import mujoco
 import numpy as np
+from sauna.training.loop.host.loop import host
 
-from sauna import rundir, training
-from sauna.bench.rates import ratio
-from sauna.collect.host import Collected, HostCollector
-from sauna.core.population import Program, make_program, member_keys, minibatch_order
-from sauna.core.types import TrainState
-from sauna.envs.contract import Step, episode_seed
-from sauna.envs.gymnasium import env_maker
-from sauna.envs.mujoco import MujocoEnvs
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout.host import Collected, HostCollector
+from sauna.algorithm.rollout.program import Program, make_program
+from sauna.algorithm.types import TrainState, member_keys
+from sauna.config.presets import members, resolve
+from sauna.envs.host.contract import Step, episode_seed
+from sauna.envs.host.mujoco_envs import MujocoEnvs
+from sauna.envs.make import env_maker
 from sauna.envs.probe import probe
-from sauna.member_state import Counters
-from sauna.presets import members, resolve
-from sauna.run import settle
-from sauna.worker import configure_jax
+from sauna.experiments.bench.rates import ratio
+from sauna.system import run_directory
+from sauna.system.jax_setup import configure_jax
+from sauna.training.loop.member_state import Counters
+from sauna.training.prepare import settle
 
 HERE = Path(__file__).parent
 RESULT = HERE.parent / "results" / "compiled_stepper.json"
@@ -215,7 +217,7 @@ class RecordedEnvs(MujocoEnvs):
 class Case(NamedTuple):
     """What is played: a task, and members at some point of their training."""
 
-    job: training.Job
+    job: host.Job
     program: Program
     keys: list[Any]
     states: list[TrainState]
@@ -245,7 +247,7 @@ class Case(NamedTuple):
             collector.arrays["next_reset"][:] = 0
 
     def collect(self, collector: HostCollector, iteration: int = 0) -> list[Collected]:
-        hypers = [training._hypers(self.job, p, Counters(), 0) for p in range(len(self.keys))]
+        hypers = [host._hypers(self.job, p, Counters(), 0) for p in range(len(self.keys))]
         limit = np.full(len(self.keys), self.job.config.rollout_steps)
         return collector.collect(self.params, hypers, iteration, limit)
 
@@ -254,7 +256,7 @@ def make_case(env: str, iterations: int) -> Case:
     given = {"env": env, "arm": "ppo", "seeds": MEMBERS, "processes": 1}
     config, found = resolve(given), probe(env, {})
     config = settle(config, found.spaces)
-    job = training.Job(config, found.spaces, {}, members(config, given), [], None, 0, True)
+    job = host.Job(config, found.spaces, {}, members(config, given), [], None, 0, True)
     program, keys = make_program(config, found.spaces), [member_keys(s) for s in config.seeds]
     case = Case(job, program, keys, [program.init(k.init) for k in keys], None)
     if not iterations:
@@ -273,9 +275,9 @@ def learn(case: Case, collected: list[Collected], iteration: int) -> list[TrainS
     states = []
     for p, member in enumerate(case.job.members):
         order = minibatch_order(case.job.config, member.seed, iteration)
-        hypers = training._hypers(case.job, p, Counters(), iteration)
+        hypers = host._hypers(case.job, p, Counters(), iteration)
         copy = jax.tree.map(lambda leaf: leaf.copy(), case.states[p])  # the update takes it over
-        states.append(training._learn(case.program, copy, collected[p], hypers, order)[0])
+        states.append(host._learn(case.program, copy, collected[p], hypers, order)[0])
     return jax.block_until_ready(states)
 
 
@@ -524,9 +526,9 @@ def main() -> None:
     library = build()
     compiler = subprocess.run(["g++", "--version"], capture_output=True, text=True, check=True)
     result: dict[str, Any] = {
-        "machine": rundir.machine(),
-        "versions": rundir.versions() | {"g++": compiler.stdout.splitlines()[0]},
-        "git": rundir.git_revision(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions() | {"g++": compiler.stdout.splitlines()[0]},
+        "git": run_directory.git_revision(),
         "flags": FLAGS,
         "members": MEMBERS,
         "rollout_steps": resolve({"env": "Hopper-v5", "arm": "ppo"}).rollout_steps,
@@ -543,7 +545,7 @@ def main() -> None:
         for name, values in found["to_raw_c"].items():
             print(f"  {name:18} {values['median']:.3f} {values['low']:.3f} {values['high']:.3f}")
     result["load_average"]["end"] = os.getloadavg()[0]
-    rundir.write_json(RESULT, result)
+    run_directory.write_json(RESULT, result)
     write_tables(result)
     print(tables(result))
 

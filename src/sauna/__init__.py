@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sauna.algorithm.learner.vex_targets import VexTarget
+    from sauna.algorithm.types import Filter
     from sauna.api import Result, compare, load, resume, train
-    from sauna.envs.jax_env import JaxEnv, Transition
-    from sauna.errors import BadInput, SaunaError
-    from sauna.evaluation import evaluate
-    from sauna.inspection.command import inspect
-    from sauna.selection.filters import Filter
-    from sauna.selection.vex import VexTarget
+    from sauna.envs.device.contract import JaxEnv, Transition
+    from sauna.experiments.evaluate.episodes import evaluate
+    from sauna.experiments.inspect.command import inspect
+    from sauna.system.errors import BadInput, SaunaError
 
 __version__ = "0.1.0"
 
@@ -19,19 +19,19 @@ __all__ = ["BadInput", "Filter", "JaxEnv", "Result", "SaunaError", "Transition",
            "compare", "evaluate", "inspect", "load", "resume", "train"]  # fmt: skip
 
 _HOMES = {
-    "BadInput": "sauna.errors",
-    "SaunaError": "sauna.errors",
+    "BadInput": "sauna.system.errors",
+    "SaunaError": "sauna.system.errors",
     "Result": "sauna.api",
     "compare": "sauna.api",
     "load": "sauna.api",
     "resume": "sauna.api",
     "train": "sauna.api",
-    "JaxEnv": "sauna.envs.jax_env",
-    "Transition": "sauna.envs.jax_env",
-    "evaluate": "sauna.evaluation",
-    "inspect": "sauna.inspection.command",
-    "Filter": "sauna.selection.filters",
-    "VexTarget": "sauna.selection.vex",
+    "JaxEnv": "sauna.envs.device.contract",
+    "Transition": "sauna.envs.device.contract",
+    "evaluate": "sauna.experiments.evaluate.episodes",
+    "inspect": "sauna.experiments.inspect.command",
+    "Filter": "sauna.algorithm.selection.vex_filter",
+    "VexTarget": "sauna.algorithm.learner.vex_targets",
 }
 
 

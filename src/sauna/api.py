@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sauna import local, rundir
-from sauna import run as runs
-from sauna.errors import BadInput
-from sauna.metrics.display import Display, PlainDisplay, make_display
-from sauna.names import name_of
-from sauna.presets import COMPARED, parse_all
+from sauna.config import local
+from sauna.config.plugins import is_local, name_of
+from sauna.config.presets import COMPARED, parse_all
+from sauna.experiments.report.curve import draw_curve
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, Interrupted
+from sauna.training import run as runs
+from sauna.training.display import Display, PlainDisplay, make_display
+from sauna.training.train import train_run
 
 PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
 
@@ -25,12 +28,12 @@ class Result:
     @property
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of `metrics.jsonl`, one per iteration and member."""
-        return rundir.rows(self.path)
+        return run_directory.rows(self.path)
 
     @property
     def summary(self) -> dict[str, Any]:
         """`member name -> final numbers`, as in `summary.json`."""
-        return rundir.read_config_file(self.path / "summary.json")["members"]
+        return run_directory.read_config_file(self.path / "summary.json")["members"]
 
     def policy(self, member: int | str = 0) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`."""
@@ -51,8 +54,8 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
     Args:
       env: a Gymnasium id, `module:function`, or a function that makes an environment.
       quiet: show nothing.
-      **settings: any field of `sauna.config.Config` (`arm="sauna"`, `seeds=6`, `steps=1_000_000`);
-        functions, flax modules, filters and targets may be passed by value.
+      **settings: any field of `sauna.config.settings.Config` (`arm="sauna"`, `seeds=6`,
+        `steps=1_000_000`); functions, flax modules, filters and targets may be passed by value.
 
     Raises:
       BadInput: a setting is not usable; nothing was created.
@@ -65,8 +68,22 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
         given["out"] = str(settings["out"])
     display: Display = _Silent() if quiet else make_display()
     run = runs.start(given, display)
-    runs.train(run, display, resume=False)
+    train_and_draw(run, display, resume=False)
     return Result(run.path)
+
+
+def train_and_draw(run: runs.Run, display: Display, *, resume: bool, inexact: bool = False) -> None:
+    """Trains a run to its end, or to where a signal stops it, and draws its learning curve.
+
+    Raises:
+      BadInput, Interrupted, SaunaError: as `train_run`.
+    """
+    try:
+        train_run(run, display, resume=resume, inexact=inexact)
+    except Interrupted:
+        draw_curve(run.path)
+        raise
+    draw_curve(run.path)
 
 
 def compare(
@@ -97,13 +114,13 @@ def compare(
     Raises:
       BadInput: something is not usable; nothing was created.
     """
-    from sauna.study.command import compare_command, comparison, study
+    from sauna.experiments.study.command import compare_command, comparison, study
 
     given = {"env": name_of(env), **settings}
     for name in PARTS:
         if name in given:
             given[name] = name_of(given[name])
-            if given[name].startswith(local.__name__ + ":"):
+            if is_local(given[name]):
                 raise BadInput(f"{name}: other processes cannot import it; put it into a module")
     task = given.pop("env")
     spec = comparison(task, tuple(arms), parse_all(given))
@@ -126,7 +143,7 @@ def resume(
     display: Display = _Silent() if quiet else make_display()
     rest = _provide(Path(path), changes)
     run = runs.reopen(Path(path), rest, display)
-    runs.train(run, display, resume=True, inexact=inexact)
+    train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
@@ -137,8 +154,8 @@ def load(path: str | Path, member: int | str = 0, **parts: Any) -> Any:
     `parts` are those that were passed by value when the run started (`env`, `network`, ...).
     """
     _provide(Path(path), parts)
-    from sauna.artifact import load_artifact
-    from sauna.trained import TrainedPolicy
+    from sauna.experiments.evaluate.artifact import load_artifact
+    from sauna.experiments.evaluate.policy import TrainedPolicy
 
     return TrainedPolicy(load_artifact(Path(path)), member)
 
@@ -149,10 +166,10 @@ def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:
     Raises:
       BadInput: a part is given that the run finds by name, or one is missing.
     """
-    config = rundir.read_config(path).get("config", {})
+    config = run_directory.read_config(path).get("config", {})
     for name in PARTS:
-        module, _, attribute = str(config.get(name)).partition(":")
-        if module == local.__name__:
+        attribute = str(config.get(name)).partition(":")[2]
+        if is_local(str(config.get(name))):
             if name in given:
                 setattr(local, attribute, given[name])
             elif not hasattr(local, attribute):

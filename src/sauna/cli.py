@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
-from sauna.errors import BadInput, Interrupted, SaunaError, nearest
-from sauna.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
+from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
+from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
+from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    from sauna.presets import RESUMABLE
+    from sauna.config.presets import RESUMABLE
 
     _add_fields(resume, list(RESUMABLE))
 
@@ -178,8 +178,9 @@ def _subparser(parser: argparse.ArgumentParser, command: str | None) -> argparse
 
 
 def _train(values: dict[str, Any]) -> None:
-    from sauna import run as runs
-    from sauna.metrics.display import make_display
+    from sauna.api import train_and_draw
+    from sauna.training import run as runs
+    from sauna.training.display import make_display
 
     given = _given_from(values.pop("config"))
     env = values.pop("env")
@@ -189,7 +190,7 @@ def _train(values: dict[str, Any]) -> None:
         runs.follow(given, display)
         return
     run = runs.start(given, display)
-    runs.train(run, display, resume=False)
+    train_and_draw(run, display, resume=False)
     print(f"learning curve: {run.path}/figures/learning_curve.png")
 
 
@@ -197,7 +198,7 @@ def _given_from(file: str | None) -> dict[str, Any]:
     """Settings of a `config.json` (of a run), or of a JSON file of plain settings."""
     if file is None:
         return {}
-    from sauna.rundir import read_config_file
+    from sauna.system.run_directory import read_config_file
 
     stored = read_config_file(Path(file))
     if "config" in stored and "given" in stored:
@@ -206,13 +207,14 @@ def _given_from(file: str | None) -> dict[str, Any]:
 
 
 def _resume(values: dict[str, Any]) -> None:
-    from sauna import run as runs
-    from sauna.metrics.display import make_display
+    from sauna.api import train_and_draw
+    from sauna.training import run as runs
+    from sauna.training.display import make_display
 
     path, inexact = Path(values.pop("run")), values.pop("inexact")
     display = make_display()
     run = runs.reopen(path, values, display)
-    runs.train(run, display, resume=True, inexact=inexact)
+    train_and_draw(run, display, resume=True, inexact=inexact)
 
 
 def _eval(values: dict[str, Any]) -> None:
@@ -220,7 +222,7 @@ def _eval(values: dict[str, Any]) -> None:
     values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
-    from sauna.evaluation import choose_renderer, evaluate
+    from sauna.experiments.evaluate.episodes import choose_renderer, evaluate
 
     if values["video"]:
         choose_renderer()
@@ -241,7 +243,7 @@ def _inspect(values: dict[str, Any]) -> None:
     values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
-    from sauna.inspection.command import inspect
+    from sauna.experiments.inspect.command import inspect
 
     path = inspect(run, **values, say=_say)
     print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)")
@@ -254,7 +256,7 @@ def _whole(values: dict[str, Any], name: str, least: int) -> int:
 
 
 def _compare(values: dict[str, Any]) -> None:
-    from sauna.study.command import compare_command, comparison
+    from sauna.experiments.study.command import compare_command, comparison
 
     env, arms = values.pop("env"), tuple(values.pop("arms").split(","))
     if not env:
@@ -265,14 +267,14 @@ def _compare(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
-    from sauna.study.command import load_spec, study_command
+    from sauna.experiments.study.command import load_spec, study_command
 
     name = values.pop("study")
     _run_study(load_spec(name), study_command(name, values["out"]), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
-    from sauna.study.command import lines, study
+    from sauna.experiments.study.command import lines, study
 
     jobs = _whole({"processes": processes}, "processes", 0)
     summary = study(spec, Path(out), command, jobs, on, address)
@@ -304,11 +306,10 @@ def _bench(values: dict[str, Any]) -> None:
         raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
     for name in ("rounds", "iterations", "scale", "script"):
         del given[name]
-    from sauna.bench.command import bench, bench_scale, report
-    from sauna.bench.device import bench_on_device, report_on_device, scale_on_device
-    from sauna.placement import placed
-    from sauna.presets import resolve
-    from sauna.run import plain
+    from sauna.config.presets import plain, resolve
+    from sauna.experiments.bench.command import bench, bench_scale, report
+    from sauna.experiments.bench.device import bench_on_device, report_on_device, scale_on_device
+    from sauna.training.prepare import placed
 
     native = placed(resolve(plain(given))).backend == "device"
     if native and values["scale"]:
@@ -345,16 +346,16 @@ def _list(values: dict[str, Any]) -> None:
             print(f"{backend}/...  (on the device; `sauna list {backend}` names them)")
         print("ALE/...  (`sauna list atari` names them)")
     elif what == "atari":
-        from sauna.envs.atari import names
+        from sauna.envs.host.atari_envs import names
 
         print("\n".join(names()))
     elif what in NATIVE:
-        from sauna.envs.jax_native import names_of
+        from sauna.envs.device.make import names_of
 
         for name in names_of(what):
             print(name)
     elif what == "studies":
-        from sauna.study.spec import built_in
+        from sauna.experiments.study.spec import built_in
 
         for name, text in built_in().items():
             print(f"{name:10} {text.splitlines()[0].removeprefix('# ')}")

@@ -60,7 +60,7 @@ def load() -> dict[str, Any]:
 
 def measure(row: int, scale: str) -> dict[str, Any]:
     """One row's experiment."""
-    from sauna import rundir
+    from sauna.system import run_directory
 
     name, module, full, small = ROWS[row]
     tries, clock = full if scale == "full" else small, time.monotonic()
@@ -71,8 +71,8 @@ def measure(row: int, scale: str) -> dict[str, Any]:
         **result._asdict(),
         "seconds": round(time.monotonic() - clock, 1),
         "sources": sources(),
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
     }
 
 

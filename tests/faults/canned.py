@@ -18,9 +18,10 @@ from unittest.mock import patch
 import sauna
 from faults.disk import Crash, Hook, Op, watched
 from helpers import SMALL, Recorder, equal, make_job, train_here
-from sauna import checkpoint, rundir, worker
-from sauna.wire import Shared, Worker, receive, send, start_thread
-from sauna.worker import PipeReporter
+from sauna.system import checkpoint, run_directory
+from sauna.system.processes import Shared, Worker, receive, send, start_thread
+from sauna.training import worker
+from sauna.training.worker import PipeReporter
 
 WORLD = "worlds:Scripted"
 BACKENDS = {"host": WORLD, "device": "jax_worlds:walk"}
@@ -66,10 +67,10 @@ def played_back(recorder: Recorder) -> Iterator[None]:
         return start_thread(partial(serve, recorder))
 
     with (
-        patch("sauna.coordinator.start_worker", start),
-        patch("sauna.coordinator.draw_curve", lambda path: None),
-        patch("sauna.rundir.git_revision", lambda: None),
-        patch("sauna.rundir.machine", dict),
+        patch("sauna.training.coordinator.start_worker", start),
+        patch("sauna.api.draw_curve", lambda path: None),
+        patch("sauna.system.run_directory.git_revision", lambda: None),
+        patch("sauna.system.run_directory.machine", dict),
         patch("os.fsync", lambda descriptor: None),
     ):
         yield
@@ -79,7 +80,9 @@ def played_back(recorder: Recorder) -> Iterator[None]:
 def trained_here() -> Iterator[None]:
     """Runs train in threads of this process, which has imported JAX already."""
     target = partial(worker.serve, dies_alone=False)
-    with patch("sauna.coordinator.start_worker", lambda module, environment: start_thread(target)):
+    with patch(
+        "sauna.training.coordinator.start_worker", lambda module, environment: start_thread(target)
+    ):
         yield
 
 
@@ -131,7 +134,7 @@ class Ended:
 
     def differs(self, run: Path) -> str | None:
         """What of another finished run has other bytes."""
-        if not rundir.is_complete(run):
+        if not run_directory.is_complete(run):
             return "the run is not complete"
         if (run / "metrics.jsonl").read_bytes() != self.metrics:
             return "metrics.jsonl has other rows"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from faults.nursery import Nursery, Process, Started
 from faults.result import Tally
-from sauna import checkpoint, rundir
+from sauna.system import checkpoint, run_directory
 
 SETTINGS = {"rollout-steps": 32, "minibatches": 4, "epochs": 2, "hidden": "8,8", "seeds": 2,
             "arm": "sauna", "threshold": 0.9, "checkpoint-every": 2, "processes": 1}  # fmt: skip
@@ -120,7 +120,7 @@ class Chain:
                 self._tally.miss(f"{what}: other rows up to iteration {iteration}")
 
     def is_complete(self) -> bool:
-        return rundir.is_complete(self.run)
+        return run_directory.is_complete(self.run)
 
     def finish(self) -> None:
         """Lets it end; everything must have the reference's bytes."""

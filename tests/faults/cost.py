@@ -34,8 +34,8 @@ TURNS = 300
 
 def of_the_host(members: int) -> dict[str, float]:
     """Shares of the time of a training, each the median of the rounds."""
-    from sauna.bench.command import RECORDS
-    from sauna.bench.split import split
+    from sauna.experiments.bench.command import RECORDS
+    from sauna.experiments.bench.split import split
 
     rounds = [split(HOST, members) for _ in range(ROUNDS)]
     shares = {name: [found[name] / sum(found.values()) for found in rounds] for name in RECORDS}
@@ -60,10 +60,11 @@ def of_the_update() -> float:
     import jax
 
     from helpers import make_job
-    from sauna.collect.host import HostCollector
-    from sauna.core.population import make_program, member_keys, minibatch_order
-    from sauna.core.types import Hypers
-    from sauna.training import make_envs
+    from sauna.algorithm.learner.update import minibatch_order
+    from sauna.algorithm.rollout.host import HostCollector
+    from sauna.algorithm.rollout.program import make_program
+    from sauna.algorithm.types import Hypers, member_keys
+    from sauna.training.loop.host import make_envs
 
     job = make_job(**{**PRESET, **HOST})
     key, member = member_keys(0), job.members[0]
@@ -95,7 +96,7 @@ def of_the_update() -> float:
 def of_the_device() -> float:
     """The checks in a whole iteration of `DEVICE`, whose environment costs next to nothing."""
     from helpers import make_job
-    from sauna.device_training import make_population
+    from sauna.training.loop.device import make_population
 
     job = make_job(**{**PRESET, **DEVICE})
 
@@ -116,16 +117,16 @@ def without_checks(compiled: Callable[[], Callable[[], Any]]) -> Callable[[], An
 
 
 def main() -> int:
-    from sauna import rundir
-    from sauna.worker import configure_jax
+    from sauna.system import run_directory
+    from sauna.system.jax_setup import configure_jax
 
     configure_jax()
     found = {
         "host": {"env": HOST["env"], "members": {str(n): of_the_host(n) for n in MEMBERS}},
         "update": of_the_update(),
         "device": {"env": DEVICE["env"], "envs": DEVICE["envs"], "share": of_the_device()},
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
     }
     print(json.dumps(found, indent=1))
     RESULTS.write_text(json.dumps(found, indent=1) + "\n")

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from sauna.checkpoint import FORMAT, _digest
+from sauna.system.checkpoint import FORMAT, _digest
 
 HARM = "touch /tmp/sauna-was-here"
 Case = Callable[[Path], None]  # makes a run directory

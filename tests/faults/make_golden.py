@@ -21,7 +21,7 @@ GOLDEN = Path(__file__).resolve().parent / "golden"
 def main() -> None:
     import sauna
     from faults.canned import BACKENDS, SETTINGS
-    from sauna.checkpoint import FORMAT, numbered
+    from sauna.system.checkpoint import FORMAT, numbered
 
     GOLDEN.mkdir(exist_ok=True)
     os.chdir(GOLDEN)
@@ -29,7 +29,10 @@ def main() -> None:
         run = Path(f"format-{FORMAT}-{backend}")
         if run.exists():
             continue
-        with patch("sauna.rundir.git_revision", lambda: None), patch("sauna.rundir.machine", dict):
+        with (
+            patch("sauna.system.run_directory.git_revision", lambda: None),
+            patch("sauna.system.run_directory.machine", dict),
+        ):
             sauna.train(
                 world, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=3, **SETTINGS
             )

@@ -2,9 +2,9 @@
 
 Importing JAX takes seconds, and hundreds of trials need a fresh process each. A forked process
 runs the command line's own `main`, and its training workers are forked from it instead of being
-started as `python -m sauna.worker`; they are real processes with real pipes, which any signal can
-hit. XLA is started in each of them after the fork, never before. Every row also starts some of its
-trials as a user does, with `python -m sauna`.
+started as `python -m sauna.training.worker`; they are real processes with real pipes, which any
+signal can hit. XLA is started in each of them after the fork, never before. Every row also starts
+some of its trials as a user does, with `python -m sauna`.
 
     python -m faults.nursery        answers one JSON line per line of standard input
 """
@@ -97,7 +97,7 @@ class Nursery:
               ) -> Process:  # fmt: skip
         """Starts `sauna ARGUMENTS`; not before `time.monotonic()` is `at`.
 
-        `silence` stands in for `watch.SILENCE`.
+        `silence` stands in for `watchdog.SILENCE`.
         """
         question = {"start": arguments, "log": str(log), "at": at, "silence": silence}
         return Forked(self, self.ask(question)["pid"], log)
@@ -127,13 +127,13 @@ def _warm() -> None:
     import scipy.stats
 
     import jax_worlds
-    import sauna.coordinator
-    import sauna.device_training
-    import sauna.evaluation
-    import sauna.run
-    import sauna.training
+    import sauna.experiments.evaluate.episodes
+    import sauna.training.coordinator
+    import sauna.training.loop.device
+    import sauna.training.loop.host
+    import sauna.training.run
     import worlds
-    from sauna.collect import moments
+    from sauna.algorithm.rollout import moments
 
     numbers = moments.ObservationMoments(1, 1, 1.0)  # loads the compiled loops
     import numpy as np
@@ -173,8 +173,8 @@ class _ForkedWorker:
 
 def _fork_worker(module: str, environment: dict[str, str]) -> Any:
     """Stands in for `wire.start_worker`: the same pipes, no new interpreter."""
-    from sauna import worker as served
-    from sauna.wire import Worker, child_ends
+    from sauna.system.processes import Worker, child_ends
+    from sauna.training import worker as served
 
     to_child_read, to_child_write = os.pipe()
     to_parent_read, to_parent_write = os.pipe()
@@ -224,9 +224,11 @@ def _run(arguments: list[str], log: str, at: float, silence: float) -> None:
         os.dup2(source, target)
     _close_all_but()
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    from sauna import cli, coordinator, watch
+    from sauna import cli
+    from sauna.system import watchdog
+    from sauna.training import coordinator
 
-    coordinator.start_worker, watch.SILENCE = _fork_worker, silence
+    coordinator.start_worker, watchdog.SILENCE = _fork_worker, silence
     time.sleep(max(0.0, at - time.monotonic()))
     code = 0
     try:

@@ -120,9 +120,9 @@ def main() -> int:
     if (run / "config.json").exists():
         command = [sys.executable, "-m", "sauna", "resume", str(run)]
     samples, code = watch(command, given.minutes)
-    from sauna import rundir
+    from sauna.system import run_directory
 
-    rows = rundir.rows(run)
+    rows = run_directory.rows(run)
     found = {
         "command": "sauna train " + " ".join(settings),
         "hours": samples[-1]["hours"],
@@ -130,8 +130,8 @@ def main() -> int:
         "env_steps": sum({row["member"]: row["env_steps"] for row in rows}.values()),
         "slopes": report(samples),
         "samples": thinned(samples),
-        "machine": rundir.machine(),
-        "versions": rundir.versions(),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
     }
     print(json.dumps({key: found[key] for key in ("hours", "exit_code", "env_steps", "slopes")},
                      indent=1))  # fmt: skip

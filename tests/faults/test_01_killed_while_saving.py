@@ -13,7 +13,7 @@ import numpy as np
 
 from faults.disk import Disk, Op, Tree, make_tree, tree_of, watched
 from faults.result import Result, Tally, assert_held
-from sauna import checkpoint
+from sauna.system import checkpoint
 
 Scenario = Callable[[Path], tuple[int, int | None]]  # (kept checkpoints, the newest good one)
 NEW = 9

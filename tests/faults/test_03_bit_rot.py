@@ -11,7 +11,7 @@ import numpy as np
 from faults.canned import BACKENDS, record
 from faults.result import Result, Tally, assert_held
 from helpers import equal
-from sauna import checkpoint
+from sauna.system import checkpoint
 
 OLD, NEW = 3, 4
 
@@ -86,7 +86,7 @@ def _judge(
 
 
 def _means_the_same(path: Path, changed: bytes, whole: bytes) -> bool:
-    from sauna.untrusted import parse_object
+    from sauna.system.safe_read import parse_object
 
     return path.name == "manifest.json" and parse_object(changed) == parse_object(whole)
 

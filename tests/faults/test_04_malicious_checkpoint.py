@@ -68,8 +68,8 @@ def _resident(field: str) -> int:
 
 def _load(run: Path) -> None:
     """What `sauna eval` does before it makes a network."""
-    from sauna.artifact import load_artifact
-    from sauna.envs.gymnasium import env_maker
+    from sauna.envs.make import env_maker
+    from sauna.experiments.evaluate.artifact import load_artifact
 
     said: list[str] = []
     artifact = load_artifact(run, said.append)
@@ -82,9 +82,9 @@ def main() -> None:
     import gymnasium
     import safetensors.numpy
 
-    import sauna.artifact
-    import sauna.envs.gymnasium
-    from sauna.errors import SaunaError
+    import sauna.envs.host.gymnasium_envs
+    import sauna.experiments.evaluate.artifact
+    from sauna.system.errors import SaunaError
 
     del gymnasium, safetensors, sauna
     place, number = Path(sys.argv[1]), int(sys.argv[2])

@@ -17,11 +17,11 @@ from faults.canned import BACKENDS, Trap, played_back, record, trained_here, unt
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
-from sauna import checkpoint, rundir
-from sauna.artifact import load_artifact
-from sauna.config import FIELDS, TYPES
-from sauna.errors import BadInput, SaunaError
-from sauna.presets import RESUMABLE
+from sauna.config.presets import RESUMABLE
+from sauna.config.settings import FIELDS, TYPES
+from sauna.experiments.evaluate.artifact import load_artifact
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput, SaunaError
 
 # A value of the same type that is another one, where adding 1 would not be.
 OTHERS = {"env_kwargs": {"speed": 2}, "arm": ["sauna"], "seeds": [7],
@@ -168,17 +168,17 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     assert sauna.load(run)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
     with trained_here():
         sauna.resume(run)
-    assert rundir.is_complete(run)
+    assert run_directory.is_complete(run)
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()
-    assert rows[:kept] == old[:kept] and len(rundir.rows(run)) == 6
+    assert rows[:kept] == old[:kept] and len(run_directory.rows(run)) == 6
 
 
 def test_other_versions_of_the_libraries_are_told(tmp_path: Path, capsys, monkeypatch) -> None:
     with played_back(record()):
         until(tmp_path / "run", Trap())
         (tmp_path / "run" / "summary.json").unlink()
-        plain = rundir.versions()
-        monkeypatch.setattr(rundir, "versions", lambda: {**plain, "jax": "9.9.9"})
+        plain = run_directory.versions()
+        monkeypatch.setattr(run_directory, "versions", lambda: {**plain, "jax": "9.9.9"})
         sauna.resume(tmp_path / "run")
     assert f"jax {plain['jax']} -> 9.9.9" in capsys.readouterr().out

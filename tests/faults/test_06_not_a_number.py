@@ -19,12 +19,19 @@ from faults.canned import trained_here
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
 from jax_worlds import FIELDS, Poison, poisoned
-from sauna import checkpoint, rundir
-from sauna.collect.device import Faults, collect
-from sauna.collect.host import HostCollector
-from sauna.core.population import make_program, member_keys
-from sauna.core.types import Hypers
-from sauna.device_program import (
+from sauna.algorithm.rollout.device import Faults, collect
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import Hypers, member_keys
+from sauna.envs.device.contract import flat
+from sauna.envs.host.contract import HostEnvs
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.make import env_maker
+from sauna.envs.workers import ProcessEnvs
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import SaunaError
+from sauna.training.loop.device import _check_sound, _setting
+from sauna.training.loop.device_program import (
     MemberState,
     Parts,
     Report,
@@ -33,12 +40,6 @@ from sauna.device_program import (
     make_parts,
     several,
 )
-from sauna.device_training import _check_sound, _setting
-from sauna.envs.contract import HostEnvs
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs, env_maker
-from sauna.envs.jax_env import flat
-from sauna.envs.workers import ProcessEnvs
-from sauna.errors import SaunaError
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 VALUES = ("nan", "inf", "-inf")
@@ -236,8 +237,8 @@ def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
         sauna.train("worlds:Poisoned", env_kwargs=kwargs, out=run, quiet=True, arm="ppo",
                     checkpoint_every=1, **{**SMALL, "steps": 3200})  # fmt: skip
     found = checkpoint.load_newest(run / "checkpoints", print)
-    assert found is not None and found.manifest["iteration"] == len(rundir.rows(run)) > 1
-    assert not rundir.is_complete(run)
+    assert found is not None and found.manifest["iteration"] == len(run_directory.rows(run)) > 1
+    assert not run_directory.is_complete(run)
 
 
 def test_a_recorded_training_that_fails_has_reported_nothing_of_the_iteration() -> None:

@@ -15,11 +15,13 @@ import pytest
 import sauna
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, Recorder, make_job
-from sauna import checkpoint, rundir, training
-from sauna.checkpoint import NotFinite, save_checkpoint
-from sauna.core.population import Program, make_program, member_keys, minibatch_order
-from sauna.core.types import Batch, Hypers, Rollout, TrainState
-from sauna.errors import SaunaError
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout.program import Program, make_program
+from sauna.algorithm.types import Batch, Hypers, Rollout, TrainState, member_keys
+from sauna.system import checkpoint, run_directory
+from sauna.system.checkpoint import NotFinite, save_checkpoint
+from sauna.system.errors import SaunaError
+from sauna.training.loop import host
 
 FIELDS = ("observation", "action", "log_prob", "advantage", "return_", "value", "vex_target")
 VALUES = (np.nan, np.inf, -np.inf)
@@ -106,7 +108,7 @@ def test_the_run_stops_and_the_last_finite_checkpoint_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The third update gets a NaN; the environment is passed by value, so it trains in here."""
-    plain, calls = training._learn, []
+    plain, calls = host._learn, []
 
     def spoiled(program: Any, state: Any, collected: Any, hypers: Any, order: Any) -> Any:
         calls.append(0)
@@ -114,14 +116,14 @@ def test_the_run_stops_and_the_last_finite_checkpoint_is_kept(
             hypers = hypers._replace(value_coef=np.float32(np.nan))
         return plain(program, state, collected, hypers, order)
 
-    monkeypatch.setattr(training, "_learn", spoiled)
+    monkeypatch.setattr(host, "_learn", spoiled)
     from worlds import Scripted
 
     run = tmp_path / "run"
     with pytest.raises(SaunaError, match="ppo/0: the update of iteration 2 is not finite"):
         sauna.train(lambda: Scripted(), out=run, quiet=True, arm="ppo", checkpoint_every=1, **SMALL)
     found = checkpoint.load_newest(run / "checkpoints", print)
-    assert found is not None and found.manifest["iteration"] == 2 == len(rundir.rows(run))
+    assert found is not None and found.manifest["iteration"] == 2 == len(run_directory.rows(run))
     assert all(np.isfinite(a).all() for a in found.arrays.values())
 
 
@@ -136,6 +138,6 @@ def test_parameters_are_checked_where_the_loss_was_still_finite() -> None:
 
 def test_a_rate_that_overflows_stops_before_anything_is_saved() -> None:
     recorder = Recorder()
-    with pytest.raises(training.NonFinite, match="iteration 0"):
-        training.train_members(make_job("worlds:Scripted", learning_rate=1e38), recorder)
+    with pytest.raises(host.NonFinite, match="iteration 0"):
+        host.train_members(make_job("worlds:Scripted", learning_rate=1e38), recorder)
     assert not recorder.rows and not recorder.states

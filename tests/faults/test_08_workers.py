@@ -26,8 +26,8 @@ from faults.chain import (
     wait_for_rows,
 )
 from faults.result import Result, Tally, assert_held
-from sauna.envs.contract import episode_seed
-from sauna.envs.gymnasium import EnvironmentFailure
+from sauna.envs.host.contract import episode_seed
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.workers import ProcessEnvs
 
 SEEDS = [(0, 0), (0, 1), (1, 0)]

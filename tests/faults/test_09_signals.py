@@ -23,8 +23,8 @@ from faults.chain import (
 )
 from faults.disk import Op
 from faults.result import Result, Tally, assert_held
-from sauna import checkpoint
-from sauna.errors import Interrupted
+from sauna.system import checkpoint
+from sauna.system.errors import Interrupted
 
 
 def experiment(signals: int, seed: int, place: Path) -> Result:

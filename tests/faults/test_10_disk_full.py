@@ -15,8 +15,9 @@ from faults.canned import BACKENDS, Ended, Trap, go, played_back, record, until
 from faults.disk import Op, tree_of, watched
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
-from sauna import checkpoint, cli
-from sauna.errors import BadInput, SaunaError
+from sauna import cli
+from sauna.system import checkpoint
+from sauna.system.errors import BadInput, SaunaError
 
 ERRORS = (errno.ENOSPC, errno.EROFS, errno.EIO)
 

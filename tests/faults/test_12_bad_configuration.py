@@ -18,8 +18,8 @@ from typing import NamedTuple
 from faults.nursery import environment
 from faults.result import Result, Tally, assert_held
 from sauna import cli
-from sauna.config import FIELDS, TYPES, flag
-from sauna.presets import ARMS, PRESETS
+from sauna.config.presets import ARMS, PRESETS
+from sauna.config.settings import FIELDS, TYPES, flag
 
 SECONDS = 1.0  # of CPU
 WORLD = "worlds:Scripted"

@@ -14,11 +14,11 @@ from typing import Any
 from faults.nursery import environment
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL
-from sauna import rundir
-from sauna.study.command import write
-from sauna.study.schedule import Executor
-from sauna.study.spec import read_spec
-from sauna.study.units import Unit, units_of
+from sauna.experiments.study.command import write
+from sauna.experiments.study.execute.executor import Executor
+from sauna.experiments.study.spec import read_spec
+from sauna.experiments.study.units import Unit, units_of
+from sauna.system import run_directory
 
 SEEDS = 20
 BAD = 1  # the seed that fails
@@ -118,7 +118,7 @@ class _Pretended(Executor):
             return
         rows = [_row(seed, iteration) for seed in unit.seeds for iteration in range(4)]
         (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-        rundir.write_json(run / "summary.json", {"complete": True})
+        run_directory.write_json(run / "summary.json", {"complete": True})
 
     def _pump(self) -> None:
         for name in list(self._running):

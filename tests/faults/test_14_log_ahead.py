@@ -10,8 +10,8 @@ from pathlib import Path
 from faults.canned import BACKENDS, Ended, Trap, go, played_back, record, until
 from faults.disk import Disk, Op, Tree, make_tree
 from faults.result import Result, Tally, assert_held
-from sauna import rundir
-from sauna.errors import SaunaError
+from sauna.system import run_directory
+from sauna.system.errors import SaunaError
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
@@ -49,7 +49,7 @@ def _kill(run: Path, world: str, at: int, expected: Ended, tally: Tally) -> None
     shutil.rmtree(run, ignore_errors=True)
     until(run, Trap(at), world)
     tally.count("kills")
-    if rundir.rows(run) and not (run / "checkpoints").exists():
+    if run_directory.rows(run) and not (run / "checkpoints").exists():
         tally.count("rows, but no checkpoint yet")
     _go_on(run, world, f"killed before operation {at}", expected, tally)
 
@@ -73,7 +73,7 @@ def _go_on(run: Path, world: str, what: str, expected: Ended, tally: Tally) -> N
         tally.lose(f"{what}: {error}")
         return
     tally.took(time.monotonic() - clock)
-    rows = [(row["member"], row["iteration"]) for row in rundir.rows(run)]
+    rows = [(row["member"], row["iteration"]) for row in run_directory.rows(run)]
     if len(set(rows)) != len(rows):
         tally.miss(f"{what}: a row is there twice")
     if expected.differs(run):

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.gymnasium import make_env
-from sauna.errors import BadInput, one_line
-from sauna.spaces import Spaces, describe, observation_reader
+from sauna.envs.make import make_env
+from sauna.envs.spaces import Spaces, describe, observation_reader
+from sauna.system.errors import BadInput, one_line
 
 STEPS = 25
 
@@ -51,7 +51,7 @@ def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
       BadInput: the environment cannot be made, its spaces are not supported, or it is a user's own
         and cannot be compiled.
     """
-    from sauna.envs.jax_native import make_jax_env
+    from sauna.envs.device.make import make_jax_env
 
     made = make_jax_env(env, env_kwargs)
     spaces = describe(made.observation_space, made.action_space)
@@ -68,7 +68,7 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
     """
     import jax
 
-    from sauna.envs.jax_env import flat
+    from sauna.envs.device.contract import flat
 
     one = flat(made)
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from sauna.envs.backend import in_process_envs
-from sauna.envs.contract import HostEnvs, Snapshot, Step
-from sauna.envs.gymnasium import EnvironmentFailure, GymnasiumEnvs
-from sauna.errors import SaunaError
-from sauna.spaces import read_spaces
-from sauna.wire import Message, child_ends, receive, send, start_worker
+from sauna.envs.host.contract import HostEnvs, Snapshot, Step
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.make import in_process_envs
+from sauna.envs.spaces import read_spaces
+from sauna.system.errors import SaunaError
+from sauna.system.processes import Message, child_ends, receive, send, start_worker
 
 STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
 NOTICE = 0.2  # seconds after which the end of a worker is noticed while another one is awaited

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 from mujoco import mjx
 
+from sauna.envs.device.contract import JaxEnv, Transition
 from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.physics import (
     after_throw,
@@ -23,7 +24,6 @@ from sauna.envs.flagrun.physics import (
     spaces,
 )
 from sauna.envs.flagrun.picture import Painter
-from sauna.envs.jax_env import JaxEnv, Transition
 
 
 class FlagrunState(NamedTuple):

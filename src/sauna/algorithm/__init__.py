@@ -1,0 +1,1 @@
+"""The science: pure functions on pytrees, for one member. Begin with `types.py`."""

@@ -1,0 +1,51 @@
+"""What is logged of an update."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from sauna.algorithm.learner.ppo import weighted_mean
+from sauna.algorithm.types import Array
+
+
+class UpdateMetrics(NamedTuple):
+    """Scalars of one iteration. Losses are means over all minibatches.
+
+    What an algorithm or a rollout does not have is NaN.
+    """
+
+    policy_loss: Array
+    value_loss: Array
+    vex_loss: Array
+    entropy: Array
+    kl: Array
+    clip_fraction: Array
+    gradient_norm: Array  # before clipping
+    explained_variance: Array  # 1 - Var(R - V_old) / Var(R) of the kept steps
+    vex_target: Array  # mean target over the kept steps
+    vex_mean: Array  # of the head's predictions over all env steps
+    vex_spread: Array  # their standard deviation
+    vex_median: Array
+    threshold: Array  # where it moves: that of this iteration; else NaN
+    finite: Array  # bool: parameters and losses are finite
+
+
+def variance_explained(return_: Array, value: Array, weight: Array) -> Array:
+    """`1 - Var(R - V) / Var(R)` over the samples of weight 1; NaN where R does not vary."""
+
+    def variance(x: Array) -> Array:
+        return weighted_mean((x - weighted_mean(x, weight)) ** 2, weight)
+
+    return 1.0 - variance(return_ - value) / variance(return_)
+
+
+def head_statistics(vex: Array, valid: Array) -> tuple[Array, Array, Array]:
+    """Mean, standard deviation and median of the head's predictions over all env steps."""
+    number = jnp.sum(valid)
+    mean = jnp.sum(jnp.where(valid, vex, 0.0)) / number
+    spread = jnp.sqrt(jnp.sum(jnp.where(valid, (vex - mean) ** 2, 0.0)) / number)
+    ordered = jnp.sort(jnp.where(valid, vex, jnp.inf).ravel())
+    median = 0.5 * (ordered[(number - 1) // 2] + ordered[number // 2])
+    return mean, spread, median

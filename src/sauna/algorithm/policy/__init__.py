@@ -1,0 +1,1 @@
+"""The policy: networks, action distributions, normalisation."""

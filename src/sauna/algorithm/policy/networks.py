@@ -1,0 +1,102 @@
+"""The actor-critic with its third head, and the trunks it stands on (flax.linen).
+
+Initialisation follows baselines: orthogonal weights with gain sqrt(2) in the trunks, 0.01 for the
+policy head, 1 for the value and Vex heads, zero biases.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import flax.linen as nn
+import jax.numpy as jnp
+
+from sauna.algorithm.policy.convolutions import LAYERS, Layer, convolutions
+from sauna.algorithm.types import Array, PolicyOutput
+
+
+def dense(width: int, gain: float, name: str) -> nn.Dense:
+    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(gain), name=name)
+
+
+class MLP(nn.Module):
+    """`[..., obs]` -> `[..., hidden[-1]]`, one activation after each layer."""
+
+    hidden: Sequence[int]
+    activation: str = "tanh"
+
+    @nn.compact
+    def __call__(self, observation: Array) -> Array:
+        activate = {"tanh": nn.tanh, "relu": nn.relu}[self.activation]
+        x = observation
+        for i, width in enumerate(self.hidden):
+            x = activate(dense(width, math.sqrt(2.0), f"layer_{i}")(x))
+        return x
+
+
+class Convolution(nn.Module):
+    """The parameters of one of `convolutions`: kernel `[K, K, C, F]` and bias `[F]`."""
+
+    features: int
+    width: int
+
+    @nn.compact
+    def __call__(self, channels: int) -> Layer:
+        shape = (self.width, self.width, channels, self.features)
+        kernel = self.param("kernel", nn.initializers.orthogonal(math.sqrt(2.0)), shape)
+        return kernel, self.param("bias", nn.initializers.zeros, (self.features,))
+
+
+class NatureCNN(nn.Module):
+    """Images `[..., H, W, C]` -> `[..., 512]` (Mnih et al. 2015, as in baselines).
+
+    uint8 images are scaled to [0, 1] here, so that rollouts hold bytes.
+    """
+
+    @nn.compact
+    def __call__(self, observation: Array) -> Array:
+        lead = observation.shape[:-3]
+        x = observation.reshape((-1, *observation.shape[-3:]))
+        layers, channels = [], x.shape[-1]
+        for i, (features, width, _) in enumerate(LAYERS):
+            layers.append(Convolution(features, width, name=f"conv_{i}")(channels))
+            channels = features
+        x = convolutions(layers, x)
+        x = nn.relu(dense(512, math.sqrt(2.0), "dense")(x.reshape((x.shape[0], -1))))
+        return x.reshape((*lead, -1))
+
+
+class ActorCritic(nn.Module):
+    """Policy, value and Vex heads on a shared trunk or on two separate ones.
+
+    The Vex head is one linear unit on the value's last hidden layer. It always exists, so that
+    arms with and without it share one program and one initialisation.
+
+    Attributes:
+      make_trunk: builds the trunk module under a given name.
+      num_outputs: width of the policy head.
+      log_std_init: start of the state-independent log-std, or None for discrete actions.
+      shared: one trunk for all heads.
+    """
+
+    make_trunk: Callable[[str], nn.Module]
+    num_outputs: int
+    log_std_init: float | None
+    shared: bool
+
+    @nn.compact
+    def __call__(self, observation: Array) -> PolicyOutput:
+        """`[..., *obs]` -> `PolicyOutput` with leading axes `[...]`."""
+        policy_features = self.make_trunk("trunk" if self.shared else "policy_trunk")(observation)
+        value_features = (
+            policy_features if self.shared else self.make_trunk("value_trunk")(observation)
+        )
+        policy = dense(self.num_outputs, 0.01, "policy_head")(policy_features)
+        if self.log_std_init is not None:
+            start = nn.initializers.constant(self.log_std_init)
+            log_std = self.param("log_std", start, (self.num_outputs,))
+            policy = jnp.concatenate([policy, jnp.broadcast_to(log_std, policy.shape)], -1)
+        value = dense(1, 1.0, "value_head")(value_features)[..., 0]
+        vex = dense(1, 1.0, "vex_head")(value_features)[..., 0]
+        return PolicyOutput(policy, value, vex)

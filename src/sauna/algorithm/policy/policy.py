@@ -1,0 +1,129 @@
+"""The policy of one member: network and action distribution, as functions of flat parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from sauna.algorithm.policy.distributions import (
+    Distribution,
+    bernoulli,
+    gaussian,
+    multi_categorical,
+)
+from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN
+from sauna.algorithm.types import Array, Params, PolicyOutput
+from sauna.config.plugins import import_name
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+from sauna.system.errors import BadInput
+
+
+class Policy(NamedTuple):
+    """Pure functions of one member's flat parameters `[D]`.
+
+    Attributes:
+      init: `key -> params [D]`.
+      apply: `(params, observation [..., *obs]) -> PolicyOutput`.
+      unravel: `params [D] -> the flax parameter pytree`.
+      distribution: of the actions.
+    """
+
+    init: Callable[[Array], Array]
+    apply: Callable[[Array, Array], PolicyOutput]
+    unravel: Callable[[Array], Params]
+    distribution: Distribution
+
+
+def make_distribution(spaces: Spaces) -> Distribution:
+    if spaces.action_kind == "continuous":
+        return gaussian(spaces.action_sizes[0])
+    if spaces.action_kind == "multi_binary":
+        return bernoulli(spaces.action_sizes[0])
+    return multi_categorical(spaces.action_sizes)
+
+
+def make_trunk(config: Config, spaces: Spaces) -> Callable[[str], nn.Module]:
+    """A function that builds the trunk `config.network` names.
+
+    Raises:
+      BadInput: a user's `module:name` is not a flax module.
+    """
+    if config.network == "mlp":
+        return partial(_named, MLP, hidden=config.hidden, activation=config.activation)
+    if config.network == "nature-cnn":
+        return partial(_named, NatureCNN)
+    make = import_name("network", config.network)
+    if isinstance(make, nn.Module):
+        return lambda name: make.clone(name=name)
+    if isinstance(make, type) and issubclass(make, nn.Module):
+        return partial(_named, make)
+    raise BadInput(f"network: {config.network} is not a flax.linen module")
+
+
+def _named(module: Callable[..., nn.Module], name: str, **settings: Any) -> nn.Module:
+    return module(name=name, **settings)
+
+
+def _unraveler(example: Params) -> Callable[[Array], Params]:
+    """The inverse of `ravel_pytree` for trees like `example`, of numpy or JAX vectors.
+
+    It keeps the vector's precision.
+    """
+    leaves, structure = jax.tree_util.tree_flatten(example)
+    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+
+    def unravel(vector: Array) -> Params:
+        parts = (np if isinstance(vector, np.ndarray) else jnp).split(vector, ends)
+        shaped = [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)]
+        return jax.tree_util.tree_unflatten(structure, shaped)
+
+    return unravel
+
+
+def make_policy(config: Config, spaces: Spaces) -> Policy:
+    """The policy that `config` describes for environments with these `spaces`."""
+    distribution = make_distribution(spaces)
+    network = ActorCritic(
+        make_trunk(config, spaces),
+        distribution.num_outputs,
+        config.log_std_init if distribution.has_log_std else None,
+        config.trunk == "shared",
+    )
+    example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
+    unravel = _unraveler(jax.eval_shape(network.init, jax.random.key(0), example))
+
+    def init(key: Array) -> Array:
+        return ravel_pytree(network.init(key, example))[0]
+
+    def apply(params: Array, observation: Array) -> PolicyOutput:
+        return network.apply(unravel(params), observation)
+
+    return Policy(init, apply, unravel, distribution)
+
+
+def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Array:
+    """Actions `[N, A]` in the N envs of a member.
+
+    Args:
+      observation: `[N, *obs]` normalised; noise: `[N, M]` from `distribution.draw`.
+    """
+    return policy.distribution.sample(policy.apply(params, observation).policy, noise)
+
+
+def score(policy: Policy, params: Array, observation: Array, action: Array) -> Array:
+    """`[L, N, 3]`: log-probability of the action taken, value and Vex, side by side.
+
+    Args:
+      observation: `[L, N, *obs]` normalised; action: `[L, N, A]`.
+    """
+    output = policy.apply(params, observation)
+    log_prob = policy.distribution.log_prob(output.policy, action)
+    return jnp.stack([log_prob, output.value, output.vex], -1)

@@ -1,0 +1,1 @@
+"""Collecting a rollout, on the host or on the device."""

@@ -1,0 +1,179 @@
+"""How the members of a process choose actions at each vector step.
+
+Acting needs the policy head alone: log-probabilities, values and Vex are computed afterwards for a
+whole stretch (`Program.score`). For an MLP the few small products are a loop of our own, because a
+call of a JAX program costs more than they do; another network acts by such a call.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from sauna.algorithm.policy.policy import Policy
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+from sauna.system.compiled import compiled
+
+
+class Actor(Protocol):
+    """Chooses the actions of P members."""
+
+    def load(self, params: np.ndarray) -> None:
+        """Takes over the parameters `[P, D]` of the coming rollout."""
+
+    def prepare(self, noise: np.ndarray) -> np.ndarray:
+        """Many steps' noise of the distribution, `[T, P, N, M]`, in the form that `act` takes."""
+
+    def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Actions `[P, N, A]`, a new array.
+
+        Args:
+          observation: `[P, N, *obs]`, normalised.
+          noise: one step's prepared noise `[P, N, M]`.
+        """
+
+
+class CompiledActor:
+    """Acts by `Program.act`, whatever the network is."""
+
+    def __init__(self, act: Any) -> None:
+        self._act = act
+        self._params: Any = None
+
+    def load(self, params: np.ndarray) -> None:
+        import jax.numpy as jnp
+
+        self._params = jnp.asarray(params)
+
+    def prepare(self, noise: np.ndarray) -> np.ndarray:
+        return noise
+
+    def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return np.asarray(self._act(self._params, observation, noise))
+
+
+class MLPActor:
+    """Acts by a compiled loop, for the MLP trunks of `core.networks`.
+
+    Each layer's weights have a last row, the biases.
+    """
+
+    def __init__(self, config: Config, spaces: Spaces, policy: Policy, members: int) -> None:
+        self._policy, self._sample = policy, _sampler(spaces)
+        self._trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
+        self._tanh = config.activation == "tanh"
+        self._layers = [f"layer_{i}" for i in range(len(config.hidden))]
+        widths = [spaces.observation_shape[0], *config.hidden, policy.distribution.num_outputs]
+        self._weights = tuple(
+            np.zeros((members, before + 1, after), np.float32)
+            for before, after in itertools.pairwise(widths)
+        )
+        self._hidden = np.zeros((len(self._layers), config.envs, max(config.hidden)), np.float32)
+        self._scale = np.ones((members, 1, widths[-1]), np.float32)
+
+    def load(self, params: np.ndarray) -> None:
+        for p, vector in enumerate(params):
+            tree = self._policy.unravel(vector)["params"]
+            layers = [tree[self._trunk][name] for name in self._layers] + [tree["policy_head"]]
+            for weight, layer in zip(self._weights, layers, strict=True):
+                weight[p, :-1], weight[p, -1] = layer["kernel"], layer["bias"]
+            if "log_std" in tree:
+                self._scale[p] = np.exp(tree["log_std"])
+
+    def prepare(self, noise: np.ndarray) -> np.ndarray:
+        return noise * self._scale
+
+    def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        noisy = np.empty_like(noise)
+        _act(observation, self._weights, self._tanh, self._hidden, noise, noisy)
+        return self._sample(noisy)
+
+
+@compiled
+def _act(
+    observation: Any, weights: Any, is_tanh: bool, hidden: Any, noise: Any, noisy: Any
+) -> None:
+    """Writes the policy head's outputs plus `noise`, member by member, to `noisy` `[P, N, M]`."""
+    last = len(weights) - 1
+    for p in range(observation.shape[0]):
+        for n in range(observation.shape[1]):
+            x = observation[p, n]
+            for i in range(last):
+                weight = weights[i][p]
+                y = hidden[i, n, : weight.shape[1]]
+                _affine(x, weight, y)
+                if is_tanh:
+                    _tanh(y)
+                else:
+                    for j in range(len(y)):
+                        y[j] = max(y[j], np.float32(0))
+                x = y
+            y = noisy[p, n]
+            _affine(x, weights[last][p], y)
+            for j in range(len(y)):
+                y[j] += noise[p, n, j]
+
+
+@compiled
+def _affine(x: Any, weight: Any, y: Any) -> None:
+    """`y = x @ weight[:-1] + weight[-1]`; four inputs at a time, as y is written that often."""
+    inputs = len(weight) - 1
+    y[:] = weight[inputs]
+    whole = inputs - inputs % 4
+    for k in range(0, whole, 4):
+        a, b, c, d = x[k], x[k + 1], x[k + 2], x[k + 3]
+        for j in range(len(y)):
+            y[j] += (a * weight[k, j] + b * weight[k + 1, j]) + (
+                c * weight[k + 2, j] + d * weight[k + 3, j]
+            )
+    for k in range(whole, inputs):
+        for j in range(len(y)):
+            y[j] += x[k] * weight[k, j]
+
+
+@compiled
+def _tanh(y: Any) -> None:
+    """tanh in place, by the rational approximation of Eigen and XLA.
+
+    Unlike the library's function it is computed for many numbers at once.
+    """
+    number = np.float32
+    for j in range(len(y)):
+        x = min(max(y[j], number(-7.90531110763549805)), number(7.90531110763549805))
+        s = x * x
+        p = number(-2.76076847742355e-16) * s + number(2.00018790482477e-13)
+        p = p * s + number(-8.60467152213735e-11)
+        p = p * s + number(5.12229709037114e-08)
+        p = p * s + number(1.48572235717979e-05)
+        p = p * s + number(6.37261928875436e-04)
+        p = p * s + number(4.89352455891786e-03)
+        q = number(1.19825839466702e-06) * s + number(1.18534705686654e-04)
+        q = q * s + number(2.26843463243900e-03)
+        q = q * s + number(4.89352518554385e-03)
+        y[j] = x * p / q
+
+
+def _sampler(spaces: Spaces) -> Callable[[np.ndarray], np.ndarray]:
+    """From the policy head's outputs plus noise to actions, as `core.distributions` has it."""
+    if spaces.action_kind == "continuous":
+        return lambda noisy: noisy
+    if spaces.action_kind == "multi_binary":
+        return lambda noisy: (noisy > 0).astype(np.int32)
+    return lambda noisy: _largest(noisy, spaces.action_sizes)
+
+
+def _largest(logits: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
+    """The largest of each categorical's logits `[..., sum(sizes)]`: int32 `[..., len(sizes)]`."""
+    parts = np.split(logits, np.cumsum(sizes)[:-1], -1)
+    return np.stack([part.argmax(-1) for part in parts], -1).astype(np.int32)
+
+
+def make_actor(config: Config, spaces: Spaces, policy: Policy, act: Any, members: int) -> Actor:
+    """The fastest actor for the network of `config`."""
+    if config.network == "mlp":
+        return MLPActor(config, spaces, policy, members)
+    return CompiledActor(act)

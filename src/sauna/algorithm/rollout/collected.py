@@ -1,0 +1,35 @@
+"""What one member collected in one iteration, whoever collected it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sauna.algorithm.types import Rollout
+from sauna.config.settings import Config
+
+
+class Episode(NamedTuple):
+    """One finished episode of a member."""
+
+    env: int
+    return_: float
+    length: int
+    truncated: bool
+    kept: bool  # whether its last step was kept (the released code reports only such episodes)
+
+
+class Collected(NamedTuple):
+    """What one member collected in one iteration."""
+
+    rollout: Rollout | None  # None: it never left the accelerator
+    env_steps: int
+    kept_steps: int
+    ended: int  # episodes that ended
+    episodes: list[Episode]  # the latest of them; on the host all
+
+
+def capacity(config: Config) -> int:
+    """Env steps per env (S) that one rollout can hold."""
+    if config.filter == "none" or config.dropped == "mask":
+        return config.rollout_steps
+    return config.rollout_steps * config.max_env_steps_factor

@@ -1,0 +1,127 @@
+"""Running normalisation on the host: observations step by step, rewards a rollout at a time.
+
+The arithmetic is `core.normalize`'s. Observations enter their moments before the policy sees
+them, so those are updated at every vector step, in place, by a compiled loop. Rewards are learned
+from only after the rollout, and are scaled then.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sauna.algorithm.policy.normalize import EPSILON, Moments, initial_moments
+from sauna.system.compiled import compiled
+
+
+class ObservationMoments:
+    """Moments of P members' observations `[P, N, D]`, updated in place.
+
+    Attributes:
+      mean, variance: `[P, D]` float64; count: `[P, 1]`.
+    """
+
+    def __init__(self, members: int, size: int, clip: float) -> None:
+        self.mean, self.variance, self.count = initial_moments((members,), size)
+        self._clip = clip
+
+    def see(self, observation: np.ndarray, acting: np.ndarray) -> None:
+        """Lets those rows of `observation` `[P, N, D]` enter that are acting (`[P, N]`)."""
+        _see(observation, acting, self.mean, self.variance, self.count)
+
+    def see_and_normalize(
+        self, observation: np.ndarray, acting: np.ndarray, out: np.ndarray
+    ) -> None:
+        """`see`, then `normalize`, in one call."""
+        _see_and_normalize(
+            observation, acting, self.mean, self.variance, self.count, EPSILON, self._clip, out
+        )
+
+    def normalize(self, observation: np.ndarray, out: np.ndarray) -> None:
+        """Writes the normalised and clipped `observation` `[P, N, D]` to `out`, float32."""
+        _normalize(observation, self.mean, self.variance, EPSILON, self._clip, out)
+
+    def of(self, member: int) -> Moments:
+        """One member's moments of `[D]`, as views."""
+        return Moments(self.mean[member], self.variance[member], self.count[member])
+
+
+@compiled
+def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) -> None:
+    """`core.normalize.update_moments`, in place."""
+    members, envs, size = observation.shape
+    for p in range(members):
+        number = acting[p].sum()
+        if number == 0:
+            continue
+        total = count[p, 0] + number
+        fraction, remains = number / total, count[p, 0] / total
+        for d in range(size):
+            batch_mean, batch_variance = 0.0, 0.0
+            for n in range(envs):
+                if acting[p, n]:
+                    batch_mean += observation[p, n, d]
+            batch_mean /= number
+            for n in range(envs):
+                if acting[p, n]:
+                    batch_variance += (observation[p, n, d] - batch_mean) ** 2
+            batch_variance /= number
+            delta = batch_mean - mean[p, d]
+            move = delta * fraction
+            mean[p, d] += move
+            variance[p, d] = (variance[p, d] + delta * move) * remains + batch_variance * fraction
+        count[p, 0] = total
+
+
+@compiled
+def _normalize(
+    observation: Any, mean: Any, variance: Any, epsilon: float, clip: float, out: Any
+) -> None:
+    """`core.normalize.normalize`, written to `out`."""
+    members, envs, size = observation.shape
+    for p in range(members):
+        for n in range(envs):
+            for d in range(size):
+                scaled = (observation[p, n, d] - mean[p, d]) / np.sqrt(variance[p, d] + epsilon)
+                out[p, n, d] = min(max(scaled, -clip), clip)
+
+
+@compiled
+def _see_and_normalize(
+    observation: Any,
+    acting: Any,
+    mean: Any,
+    variance: Any,
+    count: Any,
+    epsilon: float,
+    clip: float,
+    out: Any,
+) -> None:
+    _see(observation, acting, mean, variance, count)
+    _normalize(observation, mean, variance, epsilon, clip, out)
+
+
+def discounted_returns(
+    reward: np.ndarray, ended: np.ndarray, valid: np.ndarray, start: np.ndarray, gamma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """`G_t = gamma G_{t-1} + r_t`, begun anew after each episode.
+
+    Args:
+      reward, ended, valid: `[S, N]`; only the first rows of a column are valid.
+      start: `[N]`, G before the first row.
+
+    Returns:
+      G `[S, N]` (0 where not valid), and what the next rollout starts from `[N]`.
+    """
+    sums, last, steps = np.zeros(reward.shape), start.copy(), valid.sum(0).tolist()
+    for n, number in enumerate(steps):  # plain floats: numpy would cost more per number
+        now, column = float(start[n]), []
+        pairs = zip(reward[:number, n].tolist(), ended[:number, n].tolist(), strict=True)
+        for r, end in pairs:
+            now = now * gamma + r
+            column.append(now)
+            if end:
+                now = 0.0
+        sums[:number, n], last[n] = column, now
+    return sums, last

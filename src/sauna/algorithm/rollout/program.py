@@ -1,0 +1,115 @@
+"""The members' axis. Everything else in `core/` is written for one member."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.learner.samples import make_batch
+from sauna.algorithm.learner.update import init_state, learn
+from sauna.algorithm.learner.vex_targets import make_target
+from sauna.algorithm.policy.policy import Policy, act, make_policy, score
+from sauna.algorithm.selection.registry import make_filter
+from sauna.algorithm.types import Array, Batch, Filter, Hypers, Rollout, TrainState
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+
+
+class Program(NamedTuple):
+    """The compiled functions of one static config.
+
+    `act` takes a leading member axis `P` on every argument; the others take one member. On CPU a
+    member's numbers must not depend on its neighbours, so members are never batched into one
+    matrix product: `act` maps over them, and updates are called one by one.
+    """
+
+    config: Config
+    policy: Policy
+    filter: Filter | None
+    init: Callable[[Array], TrainState]
+    draw: Callable[[Array, Any, Any], Array]
+    act: Callable[[Array, Any, Any], Array]
+    score: Callable[[Any, Any, Any], Array]
+    value: Callable[[Any, Any], Array]
+    decide: Callable[..., tuple[Any, Array]]
+    make_batch: Callable[[Rollout, Hypers], Batch]
+    learn: Callable[[TrainState, Rollout, Batch, Hypers, Any], tuple[TrainState, UpdateMetrics]]
+
+
+def map_members(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of one member, over a leading axis of members, one after the other.
+
+    Not a `vmap`: a batched product rounds differently for 6 members than for 1, and training
+    amplifies the difference.
+    """
+    return lambda *arguments: jax.lax.map(lambda x: function(*x), arguments)
+
+
+def make_program(config: Config, spaces: Spaces) -> Program:
+    """Builds (without compiling) everything that members with this static config run."""
+    policy, target = make_policy(config, spaces), make_target(config)
+    filter = make_filter(config)
+    return Program(
+        config=config,
+        policy=policy,
+        filter=filter,
+        init=jax.jit(partial(init_state, config, policy)),
+        draw=jax.jit(partial(draw_noise, policy, config)),
+        act=jax.jit(map_members(partial(act, policy))),
+        score=jax.jit(partial(score, policy)),
+        value=jax.jit(lambda params, observation: policy.apply(params, observation).value),
+        decide=jax.jit(partial(decide, filter)) if filter else _nothing_to_decide,
+        make_batch=jax.jit(partial(make_batch, config=config, target=target)),
+        learn=jax.jit(
+            partial(learn, config=config, policy=policy, target=target), donate_argnums=(0,)
+        ),
+    )
+
+
+def draw_noise(
+    policy: Policy, config: Config, root: Array, iteration: Array, block: Array
+) -> Array:
+    """Action noise `[T, N, M]` of the rollout's rows from `block * T` on."""
+    key = jax.random.fold_in(jax.random.fold_in(root, iteration), block)
+    return policy.distribution.draw(key, (config.rollout_steps, config.envs))
+
+
+def _nothing_to_decide(*arguments: Any) -> tuple[Any, Array]:
+    raise AssertionError("a program without a filter keeps every step")
+
+
+def decide(
+    filter: Filter,
+    state: Any,
+    observation: Array,
+    vex: Array,
+    first: Array,
+    length: Array,
+    key: Array,
+    hypers: Hypers,
+) -> tuple[Any, Array]:
+    """Runs a filter over a stretch of consecutive env steps.
+
+    Args:
+      observation: `[L, N, ...]`; `vex`: `[L, N]`, of which the first `length` rows count.
+      first: index of the stretch's first step within the rollout.
+      key: the rollout's filter key; step t uses `fold_in(key, t)`.
+
+    Returns:
+      the filter's state after the stretch, and the mask `[L, N]` (False behind `length`).
+    """
+
+    def step(carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
+        t, state, mask = carry
+        step_key = jax.random.fold_in(key, first + t)
+        state, kept = filter.keep(state, observation[t], vex[t], step_key, hypers)
+        return t + 1, state, mask.at[t].set(kept)
+
+    start = (jnp.int32(0), state, jnp.zeros(vex.shape, bool))
+    _, state, mask = jax.lax.while_loop(lambda carry: carry[0] < length, step, start)
+    return state, mask

@@ -1,0 +1,1 @@
+"""Which samples the update learns from: one file per rule."""

@@ -1,0 +1,1 @@
+"""Every choice of a run: its fields, presets and arms, and how they are read."""

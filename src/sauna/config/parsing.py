@@ -1,0 +1,78 @@
+"""Text from a command line, or a Python or JSON value, as the value of a setting."""
+
+from __future__ import annotations
+
+import json
+import typing
+from typing import Any
+
+from sauna.system.errors import BadInput
+
+
+def read_value(name: str, value: Any, field_type: Any) -> Any:
+    """`value` as `field_type`; the fields `env_kwargs` and `seeds` have forms of their own.
+
+    Raises:
+      ValueError, TypeError, KeyError: it cannot be read as that.
+      BadInput: a number of seeds that is meant as a seed.
+    """
+    if name == "env_kwargs":
+        return _json_object(value)
+    if name == "seeds":
+        return _seeds(value)
+    if field_type is bool:
+        return value if isinstance(value, bool) else _BOOLEANS[str(value).lower()]
+    if field_type is int:
+        return _integer(value)
+    if field_type is float:
+        if isinstance(value, bool):
+            raise TypeError
+        return float(value)
+    if typing.get_origin(field_type) is tuple:
+        item = typing.get_args(field_type)[0]
+        parts = value.split(",") if isinstance(value, str) else list(value)
+        return tuple(str(part).strip() if item is str else _integer(part) for part in parts)
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+_BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+
+
+def _integer(value: Any) -> int:
+    """Whole numbers, also as `1e6`; a bool or 1.5 is not one."""
+    if isinstance(value, bool):
+        raise TypeError
+    if isinstance(value, int):
+        return value
+    number = float(value)
+    if not number.is_integer():
+        raise ValueError
+    return int(number)
+
+
+MOST_SEEDS = 10_000
+
+
+def _seeds(value: Any) -> tuple[int, ...]:
+    """A count (`6`, `"6"`) means seeds 0 to 5; a sequence or `"100,101"` names the seeds."""
+    if isinstance(value, str) and "," in value:
+        value = [part for part in value.split(",") if part.strip()]
+    if isinstance(value, str | int | float):
+        number = _integer(value)
+        if number > MOST_SEEDS:
+            raise BadInput(f"seeds: {number} is too many; for the seed {number} write {number},")
+        return tuple(range(number))
+    return tuple(_integer(seed) for seed in value)
+
+
+def _json_object(value: Any) -> str:
+    parsed = json.loads(value) if isinstance(value, str) else dict(value)
+    if not isinstance(parsed, dict):
+        raise ValueError
+    try:
+        return json.dumps(parsed, sort_keys=True, allow_nan=False)
+    except ValueError:  # which no reader of JSON would take back
+        raise BadInput("env_kwargs: JSON has no infinity and no NaN; 1e300 is a bound that nothing "
+                       "reaches") from None  # fmt: skip

@@ -1,0 +1,304 @@
+"""Named settings: presets, arms (which selection method), and how a run's config is resolved.
+
+A preset says how an algorithm trains; an arm says which transitions the update keeps. METHOD, in
+`docs/algorithm.md`, gives the origin of every number.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from sauna.config.settings import FIELDS, Config, check_consistent, check_read, parse, to_json
+from sauna.system.errors import BadInput, nearest
+
+# Schulman et al. (2017) and OpenAI baselines' defaults for MuJoCo are `Config`'s own defaults.
+PRESETS: dict[str, dict[str, Any]] = {
+    "mujoco": {},
+    # The SAUNA authors' run script: more epochs and a constant learning rate.
+    "mujoco-release": {"epochs": 15, "learning_rate_schedule": "constant"},
+    # Schulman et al. (2017) on Roboschool's Flagrun tasks: minibatches of 4096 of 512 x 32 steps.
+    # Their log-std was annealed and their step size followed the KL divergence; here the log-std
+    # is learned and the step size falls linearly, as everywhere else.
+    "flagrun": {"envs": 32, "rollout_steps": 512, "minibatches": 4, "epochs": 15},
+    # Schulman et al. (2017) on Atari, as in OpenAI baselines (whose clip range also falls to 0).
+    "atari": {
+        "envs": 8,
+        "rollout_steps": 128,
+        "minibatches": 4,
+        "epochs": 3,
+        "learning_rate": 2.5e-4,
+        "clip_range": 0.1,
+        "entropy_coef": 0.01,
+        "value_coef": 1.0,
+        "trunk": "shared",
+        "sign_rewards": True,
+        "normalize_rewards": False,
+    },
+    # PureJaxRL's settings for gymnax's MinAtar (examples/brax_minatar.ipynb): two 64-64 MLPs on
+    # the flattened picture. Theirs are for 10^7 steps, over which the step size falls to 0.
+    "minatar": {
+        "envs": 64,
+        "rollout_steps": 128,
+        "minibatches": 8,
+        "epochs": 4,
+        "learning_rate": 5e-3,
+        "entropy_coef": 0.01,
+        "activation": "relu",
+        "normalize_observations": False,
+        "normalize_rewards": False,
+    },
+    # Mnih et al. (2016) in its synchronous form, with OpenAI baselines' defaults (`a2c.py`).
+    # Lambda 1 makes n-step returns. A checkpoint comes after as many env steps as with PPO.
+    "a2c": {
+        "algorithm": "a2c",
+        "envs": 16,
+        "rollout_steps": 5,
+        "minibatches": 1,
+        "epochs": 1,
+        "learning_rate": 7e-4,
+        "optimizer": "rmsprop",
+        "normalize_advantages": False,
+        "entropy_coef": 0.01,
+        "gae_lambda": 1.0,
+        "trunk": "shared",
+        "checkpoint_every": 1280,
+    },
+}
+PRESETS["a2c-atari"] = {**PRESETS["a2c"], "sign_rewards": True, "normalize_rewards": False}
+PRESETS["a2c-mujoco"] = {**PRESETS["a2c"], "entropy_coef": 0.0, "trunk": "separate"}
+
+# The preset of an algorithm where none is named.
+FIRST = {"ppo": "mujoco", "a2c": "a2c"}
+
+PRESET_HELP = {
+    "mujoco": "PPO on MuJoCo as published (Schulman et al. 2017, OpenAI baselines)",
+    "mujoco-release": "the same as the SAUNA authors ran it: 15 epochs, constant learning rate",
+    "flagrun": "PPO on HumanoidFlagrunHarder: 32 actors, 512 steps each, minibatches of 4096",
+    "atari": "PPO on Atari as published: Nature CNN, 8 games, signs of rewards",
+    "minatar": "PPO on gymnax's MinAtar as PureJaxRL runs it: 64 environments, 64-64 MLPs",
+    "a2c": "A2C's numbers as published (Mnih et al. 2016, baselines): 16 actors, 5 steps each",
+    "a2c-atari": "the same on Atari: signs of rewards, none of them normalised",
+    "a2c-mujoco": "the same for continuous control: separate trunks, no entropy bonus",
+}
+
+ARMS: dict[str, dict[str, Any]] = {
+    "ppo": {"filter": "none", "vex_coef": 0.0},
+    "vex-head": {"filter": "none"},
+    "random-drop": {"filter": "random-drop"},
+    "sauna": {"filter": "sauna", "vex_target": "sample"},
+    "sauna-paper": {"filter": "sauna", "vex_target": "rollout"},
+    "sauna-reference": {
+        "filter": "sauna",
+        "vex_target": "minibatch",
+        "history": "kept",
+        "decision": "joint",
+        "gae_over": "kept",
+        "truncation": "terminate",
+        "budget": "kept",
+        # The released loop has no bound and can run for ever; this one is rarely reached.
+        "max_env_steps_factor": 16,
+    },
+}
+
+ARM_HELP = {
+    "ppo": "PPO (or A2C) alone: no Vex loss, nothing dropped",
+    "vex-head": "the Vex head is trained, nothing is dropped",
+    "random-drop": "as SAUNA, but drops at random at a given rate (a control)",
+    "sauna": "the corrected method: every state has its own Vex target",
+    "sauna-paper": "the method as the paper states it",
+    "sauna-reference": "the method as the authors' released code does it, quirks included",
+}
+
+# The arms of a comparison where none are named; the first is the baseline.
+COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+
+# Settings that a study or a comparison decides itself.
+DECIDED = ("env", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
+
+# What makes an arm what its name says; the user's own values do not apply to these.
+FIXED: dict[str, tuple[str, ...]] = {
+    "ppo": ("filter", "vex_coef"),
+    "vex-head": ("filter",),
+    "random-drop": ("filter",),
+}
+
+# Rules of the experiment rather than of the filter: an unfiltered arm that shares a filtered one's
+# program takes them over, and so does a coin that repeats its drop rates: only the filter differs.
+SHARED_RULES = ("vex_target", "filter", "threshold_schedule", "keep_rate_target", "history",
+                 "decision", "dropped", "max_env_steps_factor", "gae_over", "truncation",
+                 "budget")  # fmt: skip
+
+
+# Fields that `resume` may change: they do not touch what is computed, or only its rounding where
+# another number of devices computes it.
+RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
+             "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
+# Fields of a stored config that the environment or the place of the run decided.
+SETTLED = ("out", "network", "normalize_observations")
+
+
+class Member(NamedTuple):
+    """One seed of one arm: what a population is made of."""
+
+    name: str
+    arm: str
+    seed: int
+    config: Config
+
+
+def resolve(given: Mapping[str, Any]) -> Config:
+    """The config of a run: defaults < preset < arm < what the user gave.
+
+    With several arms, the program-shaping values are those of the arm that filters.
+
+    Raises:
+      BadInput: an unknown key, arm or preset (naming the nearest), or impossible values.
+    """
+    parsed = parse_all(given)
+    arms = parsed.get("arm", FIELDS["arm"].default)
+    _check_arms(arms, parsed)
+    configs = [arm_config(arm, parsed) for arm in arms]
+    check_read(configs, parsed)
+    shared = next((config for config in configs if config.filter != "none"), configs[0])
+    for arm, config in zip(arms, configs, strict=True):
+        _check_same_program(arm, config, shared)
+    check_consistent(shared)
+    return shared
+
+
+def members(config: Config, given: Mapping[str, Any]) -> list[Member]:
+    """All members of a run, arm by arm and seed by seed; each with its own arm's config."""
+    parsed = parse_all(given)
+    return [
+        Member(f"{arm}/{seed}", arm, seed, _member_config(arm, parsed, config))
+        for arm in config.arm
+        for seed in config.seeds
+    ]
+
+
+def parse_all(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Each given value as its field's type.
+
+    Raises:
+      BadInput: an unknown key, or a value that cannot be read.
+    """
+    for name in given:
+        if name not in FIELDS:
+            raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
+    return {name: parse(name, value) for name, value in given.items()}
+
+
+def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
+    if not arms or len(set(arms)) != len(arms):
+        raise BadInput("arm: give each arm once, and at least one")
+    for arm in arms:
+        if arm not in ARMS:
+            raise BadInput(f"unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
+    chosen_preset(parsed)
+    for name in parsed:
+        if all(name in FIXED.get(arm, ()) for arm in arms):
+            raise BadInput(f"{name}: fixed by arm {', '.join(arms)}; `--arm sauna` lets you set it")
+
+
+def chosen_preset(parsed: Mapping[str, Any]) -> str:
+    """The preset that is named, or the first one of the algorithm.
+
+    Raises:
+      BadInput: there is no such preset, or it is another algorithm's than the one named.
+    """
+    algorithm = parsed.get("algorithm")
+    preset = parsed.get("preset", FIRST[algorithm or Config.algorithm])
+    if preset not in PRESETS:
+        known = ", ".join(PRESETS)
+        raise BadInput(f"unknown preset {preset!r} (known: {known}){nearest(preset, PRESETS)}")
+    if algorithm is not None and algorithm_of(preset) != algorithm:
+        known = ", ".join(name for name in PRESETS if algorithm_of(name) == algorithm)
+        raise BadInput(f"preset: {preset} is not one of {algorithm}'s ({known})")
+    return preset
+
+
+def algorithm_of(preset: str) -> str:
+    """The algorithm that a preset is for."""
+    return str(PRESETS[preset].get("algorithm", Config.algorithm))
+
+
+def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
+    """Defaults < preset < arm < what the user gave and the arm does not fix; not checked."""
+    preset = chosen_preset(parsed)
+    own = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
+    settings = {**PRESETS[preset], **ARMS[arm], **own, "preset": preset}
+    return dataclasses.replace(Config(), **settings)
+
+
+def _member_config(arm: str, parsed: Mapping[str, Any], shared: Config) -> Config:
+    """An arm's own traced values on the shared program; filter off is threshold 0."""
+    own = arm_config(arm, parsed)
+    off = own.filter == "none" and shared.filter != "none"
+    rules = {name: getattr(shared, name) for name in SHARED_RULES}
+    return dataclasses.replace(own, **rules, threshold=0.0 if off else own.threshold)
+
+
+def _check_same_program(arm: str, config: Config, shared: Config) -> None:
+    if config.filter == "none" and shared.filter in ("none", "sauna"):
+        return
+    for name, field in FIELDS.items():
+        if field.metadata["shapes_program"] and getattr(config, name) != getattr(shared, name):
+            raise BadInput(
+                f"arm: {arm} differs from the other arms in {name}, which shapes the compiled "
+                f"program; train it in a run of its own"
+            )
+
+
+def stored_config(stored: Mapping[str, Any]) -> Config:
+    """The config that `config.to_json` wrote, perhaps before some fields existed.
+
+    A field that is missing has its default: whoever adds one sees to it that its default is what
+    was done before.
+
+    Raises:
+      BadInput: a key is unknown, or a value cannot be read.
+    """
+    return Config(**parse_all(stored))
+
+
+def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a user has to give to get the `stored` config again, knowing what was `given` then.
+
+    A value edited in the stored config, or whose default has changed since, is given explicitly.
+    The run directory is left out, as a new run takes a new one, and the number of processes that
+    the machine decided.
+    """
+    drift = {name: value for name, value in _drifted(stored, given).items() if name != "processes"}
+    return {name: value for name, value in {**given, **drift}.items() if name != "out"}
+
+
+def as_began(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was `given`, and what a preset or a default gave then and does not give today.
+
+    Members take their own values from it; `stored` is the config that the run began with.
+    """
+    drift = _drifted({**to_json(Config()), **stored}, given)
+    kept = {name: value for name, value in drift.items() if name not in (*RESUMABLE, *SETTLED)}
+    return {**given, **kept}
+
+
+def _drifted(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """What of the `stored` config is not what `given` comes to today."""
+    resolved = to_json(resolve(given))
+    return {
+        name: value
+        for name, value in stored.items()
+        if name not in resolved or resolved[name] != value
+    }
+
+
+def plain(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a user gave, as JSON values; `None` is not given.
+
+    Raises:
+      BadInput: an unknown key, or a value that cannot be read.
+    """
+    parsed = parse_all({name: value for name, value in given.items() if value is not None})
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}

@@ -1,0 +1,1 @@
+"""Environments as pure functions, stepped inside the compiled program."""

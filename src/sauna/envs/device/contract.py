@@ -1,0 +1,199 @@
+"""What every environment on the accelerator is, and many of them stepped together.
+
+A backend gives one environment as a pair of pure functions. It never resets by itself: the next
+episode is begun here, once for all backends, so that none of them can lose the observation that
+an episode ended with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+State = Any  # a pytree of arrays; whatever is random in an environment keeps its key in there
+
+
+class Transition(NamedTuple):
+    """One env step of one environment."""
+
+    state: State
+    observation: Array  # [*obs] that this very step reached, also where the episode ended
+    reward: Array  # [] float32
+    terminated: Array  # [] bool
+    truncated: Array  # [] bool: a time limit, and not terminated
+
+
+class JaxEnv(NamedTuple):
+    """An environment as `reset(key) -> (state, observation)` and `step(state, action)`.
+
+    Both are pure and can be compiled and vmapped; the state has the same structure, shapes and
+    dtypes always. A time limit is the environment's own: it counts in its state and says
+    `truncated`.
+
+    Attributes:
+      reset: `key -> (state, observation)`, the observation as its space has it.
+      step: `(state, action) -> Transition`; actions arrive as the action space has them.
+      observation_space, action_space: Gymnasium spaces.
+      render: `state -> image [H, W, 3] uint8` on the host, where there is one.
+      frames_per_second: of `render`'s pictures, one per env step.
+    """
+
+    reset: Callable[[Array], tuple[State, Array]]
+    step: Callable[[State, Array], Transition]
+    observation_space: Any
+    action_space: Any
+    render: Callable[[State], Any] | None = None
+    frames_per_second: float = 30.0
+
+
+def ended_where_broken(told: Transition) -> Transition:
+    """A simulation whose numbers are not finite any more ends its episode, with zeros to see.
+
+    For physics alone, where that is a known end; other environments are told of as faulty.
+    """
+    sound = jnp.all(jnp.isfinite(told.observation)) & jnp.isfinite(told.reward)
+    terminated = told.terminated | ~sound
+    return told._replace(
+        observation=jnp.where(sound, told.observation, 0.0),
+        reward=jnp.where(sound, told.reward, 0.0),
+        terminated=terminated,
+        truncated=told.truncated & ~terminated,
+    )
+
+
+class Running(NamedTuple):
+    """N environments in the middle of their episodes."""
+
+    state: State  # [N, ...]
+    observation: Array  # [N, *obs] what the policy sees next
+    episode: Array  # [N] int32, 0, 1, ...
+    first: Any  # (state, observation) that `reset="cached"` returns to, else ()
+
+
+def flat(env: JaxEnv) -> JaxEnv:
+    """`env` with the arrays that the learner has: observations `[*Spaces.observation_shape]`,
+    actions `[A]`, which are clipped here and nowhere else."""
+    read, write = _reader(env.observation_space), _writer(env.action_space)
+
+    def reset(key: Array) -> tuple[State, Array]:
+        state, observation = env.reset(key)
+        return state, read(observation)
+
+    def step(state: State, action: Array) -> Transition:
+        transition = env.step(state, write(action))
+        return transition._replace(
+            observation=read(transition.observation),
+            reward=jnp.asarray(transition.reward, jnp.float32),
+            truncated=transition.truncated & ~transition.terminated,
+        )
+
+    return env._replace(reset=reset, step=step)
+
+
+def _reader(space: Any) -> Callable[[Any], Array]:
+    """The device's twin of `spaces.observation_reader`."""
+    from gymnasium import spaces as gym
+
+    from sauna.envs.spaces import describe_observation
+
+    if isinstance(space, gym.Discrete):
+        return lambda x: jax.nn.one_hot(x - space.start, int(space.n))
+    if isinstance(space, gym.Dict):
+        readers = {name: _reader(part) for name, part in space.spaces.items()}
+        return lambda x: jnp.concatenate([read(x[name]) for name, read in readers.items()])
+    kind, shape = describe_observation(space)
+    if kind == "image":
+        if shape != space.shape and len(space.shape) == 3:
+            return lambda image: jnp.moveaxis(image, 0, -1)
+        return lambda image: image.reshape(shape)
+    return lambda x: jnp.asarray(x, jnp.float32).reshape(-1)
+
+
+def _writer(space: Any) -> Callable[[Array], Any]:
+    """The device's twin of `spaces.action_writer`."""
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Box):
+        low, high = space.low.ravel(), space.high.ravel()
+        return lambda action: jnp.clip(action, low, high).reshape(space.shape)
+    if isinstance(space, gym.Discrete):
+        return lambda action: action[0] + int(space.start)
+    return lambda action: action + np.asarray(getattr(space, "start", 0))
+
+
+def begin(env: JaxEnv, key: Array, number: int, *, cached: bool) -> Running:
+    """Episode 0 of `number` environments; environment n depends on `key` and n alone."""
+    episode = jnp.zeros(number, jnp.int32)
+    state, observation = jax.vmap(env.reset)(_episode_keys(key, episode))
+    return Running(state, observation, episode, (state, observation) if cached else ())
+
+
+def _episode_keys(key: Array, episode: Array) -> Array:
+    own = jax.vmap(lambda n: jax.random.fold_in(key, n))(jnp.arange(len(episode)))
+    return jax.vmap(jax.random.fold_in)(own, episode)
+
+
+def advance(
+    env: JaxEnv,
+    running: Running,
+    action: Array,
+    acting: Array,
+    key: Array,
+    anywhere: Callable[[Array], Array],
+) -> tuple[Running, Transition]:
+    """One env step of the acting environments; where an episode ends, the next one begins.
+
+    Args:
+      action: `[N, A]`; acting: `[N]` bool, the others stay where they are.
+      key: the one given to `begin`; episode e of environment n is reset with a key made of it, n
+        and e. Not read with cached resets, which return to the environment's first state.
+      anywhere: `bool -> bool`, whether it holds in any member that is compiled together with this
+        one: then alone is the reset computed.
+
+    Returns:
+      the environments, and what the step gave (`Transition` of `[N]`; rows that did not act are
+      meaningless but for their `terminated` and `truncated`, which are False).
+    """
+    transition = jax.vmap(env.step)(running.state, action)
+    terminated = transition.terminated & acting
+    truncated = transition.truncated & acting
+    ended = terminated | truncated
+    episode = running.episode + ended
+    reached = (transition.state, transition.observation)
+
+    def fresh() -> tuple[State, Array]:
+        return jax.vmap(env.reset)(_episode_keys(key, episode))
+
+    if running.first:
+        start = _with_new_keys(running.first, episode)
+    else:
+        start = jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
+    now = (running.state, running.observation)
+    state, observation = _where(acting, _where(ended, start, reached), now)
+    told = transition._replace(terminated=terminated, truncated=truncated)
+    return Running(state, observation, episode, running.first), told
+
+
+def _with_new_keys(first: Any, episode: Array) -> Any:
+    """A cached start whose random keys are this episode's own: only the start is repeated."""
+
+    def renew(leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return leaf
+        return jax.vmap(jax.random.fold_in)(leaf, episode)
+
+    return jax.tree.map(renew, first)
+
+
+def _where(mask: Array, yes: Any, no: Any) -> Any:
+    """`yes` where `mask` `[N]`, leaf by leaf."""
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, yes, no)

@@ -1,0 +1,165 @@
+"""Which environment a name means, and what steps it: the host or the device."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sauna.config.plugins import import_name
+from sauna.config.settings import NATIVE
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.system.errors import BadInput, nearest, one_line
+
+_GYMNASIUM_ID = re.compile(r"^(?:[\w.-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
+
+
+def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
+    """A function that makes the environment; it takes further keywords such as `render_mode`.
+
+    `env` is a Gymnasium id (also `module:Id-v0`, importing the module first) or `module:function`.
+
+    Raises:
+      BadInput: there is no such environment; the nearest known id is named.
+    """
+    if is_native(env, env_kwargs):
+        from sauna.envs.device.as_gymnasium import HostFace
+        from sauna.envs.device.make import make_jax_env
+
+        return lambda **more: HostFace(make_jax_env(env, env_kwargs), **more)
+    if env.startswith("ALE/"):
+        from sauna.envs.host.atari_envs import AtariEnv, game_of
+
+        game = game_of(env)
+        return lambda **more: AtariEnv(game, **env_kwargs, **more)
+    if ":" in env and not _GYMNASIUM_ID.match(env):
+        function = import_name("env", env)
+        return lambda **more: function(**env_kwargs, **more)
+    import gymnasium
+
+    module, _, name = env.rpartition(":")
+    if module:
+        try:
+            importlib.import_module(module)
+        except Exception as error:
+            raise BadInput(f"env: cannot import {module!r}: {one_line(error)}") from error
+    if name.startswith("sauna/"):
+        tame_mujoco()
+        importlib.import_module("sauna.envs.flagrun")
+    if name not in gymnasium.registry:
+        raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
+    if "mujoco" in str(gymnasium.registry[name].entry_point):
+        tame_mujoco()
+    return lambda **more: gymnasium.make(name, disable_env_checker=True, **env_kwargs, **more)
+
+
+def tame_mujoco() -> None:
+    """MuJoCo's warnings become Python's, instead of lines on stdout and a MUJOCO_LOG.TXT.
+
+    What it calls deprecated is in the model files that Gymnasium ships: nothing for a user to mend.
+    """
+    import mujoco
+
+    def warn(message: str) -> None:
+        if "deprecated" in message:
+            return
+        text = f"MuJoCo: {message.strip()}"
+        try:
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+        except RuntimeWarning:  # made an error of: raised inside MuJoCo, it would end the process
+            print(text, file=sys.stderr)
+
+    mujoco.set_mju_user_warning(warn)
+
+
+def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
+    """One environment, or a `BadInput` that says why it cannot be made."""
+    maker = env_maker(env, env_kwargs)
+    try:
+        made = maker(**more)
+    except Exception as error:  # whatever a user's environment raises when made
+        raise BadInput(f"env: {env} cannot be made: {one_line(error)}") from error
+    if not hasattr(made, "observation_space"):
+        raise BadInput(f"env: {env} gives no environment, but {type(made).__name__}")
+    return made
+
+
+def make_drawn_env(env: str, env_kwargs: dict[str, Any]) -> Any:
+    """As `make_env`, with pictures (`rgb_array`) that follow the robot.
+
+    Where no camera is asked for, Gymnasium 1.4 draws MuJoCo tasks from where they begin, and a
+    robot that runs leaves the picture. Before, and here, the model's own camera `track` is used.
+    """
+    made = make_env(env, env_kwargs, render_mode="rgb_array")
+    renderer = getattr(getattr(made, "unwrapped", None), "mujoco_renderer", None)
+    if renderer is not None and not any("camera" in name for name in env_kwargs):
+        import mujoco
+
+        camera = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+        renderer.camera_id = camera  # -1, a free camera, where the model has none
+    return made
+
+
+def in_process_envs(
+    env: str, env_kwargs: dict[str, Any], seeds: Sequence[tuple[int, int]], backend: str
+) -> GymnasiumEnvs:
+    """M environments stepped in this process, by the fastest backend that gives the same bits.
+
+    Args:
+      env, env_kwargs: what is made; see `env_maker`.
+      seeds: `(member seed, env index)` of each environment.
+      backend: `auto`, or `gymnasium` to have every step taken by Gymnasium itself.
+    """
+    make = env_maker(env, env_kwargs)
+    if backend == "auto" and env.startswith("ALE/"):
+        from sauna.envs.host.atari_envs import AtariEnvs
+
+        return AtariEnvs(make, seeds)
+    if backend == "auto" and is_mujoco(env):
+        from sauna.envs.host.mujoco_envs import MujocoEnvs, time_limit
+
+        first = make()
+        fits = time_limit(first) is not None
+        first.close()
+        if fits:
+            return MujocoEnvs(make, seeds)
+    return GymnasiumEnvs(make, seeds)
+
+
+def is_mujoco(env: str) -> bool:
+    """Whether a registered environment's class is one of Gymnasium's MuJoCo tasks."""
+    import gymnasium
+
+    spec = gymnasium.registry.get(env)
+    return spec is not None and str(spec.entry_point).startswith("gymnasium.envs.mujoco")
+
+
+def is_native(env: str, env_kwargs: dict[str, Any]) -> bool:
+    """Whether an environment is a `JaxEnv`: it has no other place to run than the device.
+
+    Raises:
+      BadInput: it is `module:name` and that cannot be imported.
+    """
+    if env.split("/")[0] in NATIVE:
+        return True
+    if ":" not in env or "-v" in env.rpartition(":")[2]:  # a Gymnasium id, `module:Id-v0`
+        return False
+    thing = import_name("env", env)
+    if is_jax_env(thing) or not callable(thing):
+        return is_jax_env(thing)
+    try:
+        made = thing(**env_kwargs)
+    except Exception:
+        return False
+    if hasattr(made, "close"):
+        made.close()
+    return is_jax_env(made)
+
+
+def is_jax_env(thing: Any) -> bool:
+    """Whether it is a `JaxEnv`; whoever made one has imported its module."""
+    module = sys.modules.get("sauna.envs.device.contract")
+    return module is not None and isinstance(thing, module.JaxEnv)

@@ -1,0 +1,1 @@
+"""What is asked of trained members: evaluation, studies, measurements, reports."""

@@ -1,0 +1,222 @@
+"""`sauna bench`: the figures, a table of them, and a json file with the machine named."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sauna.config.presets import arm_config, plain, resolve
+from sauna.config.settings import FIELDS, Config
+from sauna.experiments.bench.peers import peer_rate, prepare, versions
+from sauna.experiments.bench.rates import (
+    WARM_UP,
+    alternate,
+    physics_rate,
+    ratio,
+    simulator,
+    training_rate,
+)
+from sauna.experiments.bench.scale import scale
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
+
+RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
+_FIELDS = [*FIELDS]
+# The settings of environment and learning, which a trainer without filters has as well.
+_LEARNING = ("env_kwargs", "truncation",
+             *_FIELDS[_FIELDS.index("envs") : _FIELDS.index("clip_rewards") + 1])  # fmt: skip
+SECONDS = 15.0  # that a peer or the physics is measured in each round
+
+
+def bench(
+    given: Mapping[str, Any],
+    *,
+    iterations: int,
+    rounds: int,
+    against: str | None,
+    script: Path | None,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Measures training with the settings `given` on this machine.
+
+    Args:
+      iterations: of each round's training, beyond the warm-up.
+      rounds: how often everything is measured, in turn.
+      against: a peer, or None; script: the file that the peer `cleanrl` is.
+      say: is told of each figure.
+
+    Returns:
+      the figures; rates are env steps per second, summed over all processes.
+
+    Raises:
+      BadInput: the settings or the peer are not usable.
+    """
+    given = plain(given)
+    config = resolve(given)
+    processes = config.processes or os.cpu_count() or 1
+    processes = min(processes, len(config.seeds) * len(config.arm))
+    batch = config.rollout_steps * config.envs
+    given |= {"steps": batch * (iterations + WARM_UP), "processes": processes}
+    measures = {"training": lambda: training_rate(given)}
+    if simulator(config.env):
+        kwargs = json.loads(config.env_kwargs)
+        measures["physics"] = lambda: physics_rate(config.env, kwargs, processes, SECONDS / 3)
+    result: dict[str, Any] = {
+        "env": config.env,
+        "arm": list(config.arm),
+        "preset": config.preset,
+        "members": len(config.seeds) * len(config.arm),
+        "processes": processes,
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
+    }
+    if against:
+        _check_peer(config, given, against)
+        python = prepare(against, say)
+        measures[against] = partial(
+            peer_rate, python, script, config.env, config.algorithm, processes, SECONDS
+        )
+        result["peer"] = {"name": against, "processes": processes, "versions": versions(python)}
+    result["rates"] = rates = alternate(measures, rounds, say)
+    result["ratios"] = {
+        name: ratio(rates["training"], others)
+        for name, others in rates.items()
+        if name != "training"
+    }
+    say("where the time goes, in one process")
+    share = -(-result["members"] // processes)
+    result["split"] = _split_elsewhere({**given, "steps": batch * 100}, share)
+    result |= start_and_memory(given)
+    return result
+
+
+def _check_peer(config: Config, given: Mapping[str, Any], against: str) -> None:
+    """Refuses settings of learning that a peer, which has those of one preset, would not read.
+
+    Arms and filters are not among them: what they cost beside a peer's PPO is a fair question.
+
+    Raises:
+      BadInput: naming the field.
+    """
+    atari = config.env.startswith("ALE/")
+    if config.algorithm != "ppo" and (against != "sb3" or atari):
+        raise BadInput(f"against: {against} is run with PPO, not with {config.algorithm}")
+    preset = "atari" if atari else "mujoco" if config.algorithm == "ppo" else "a2c-mujoco"
+    if config.preset != preset:
+        raise BadInput(f"preset: {against} runs {config.env} with the settings of {preset}, not of "
+                       f"{config.preset}")  # fmt: skip
+    usual = arm_config("ppo", {"preset": preset})
+    for name in (name for name in given if name in _LEARNING):
+        if getattr(config, name) != getattr(usual, name):
+            raise BadInput(f"{name}: not read by {against}, which runs the preset {preset}")
+
+
+def bench_scale(
+    given: Mapping[str, Any], rounds: int, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """The rate against members, environments, width and processes, with the machine named.
+
+    Raises:
+      BadInput: the settings are not usable.
+    """
+    given = plain(given)
+    config = resolve(given)
+    return {
+        "env": config.env,
+        "arm": list(config.arm),
+        "machine": run_directory.machine(),
+        "versions": run_directory.versions(),
+        "git": run_directory.git_revision(),
+        "scale": scale(given, rounds, say),
+    }
+
+
+def _split_elsewhere(given: Mapping[str, Any], share: int) -> dict[str, float]:
+    """`split` in a process that is set up as a training worker is."""
+    code = ("import json, sys; from sauna.training.worker import configure_jax; configure_jax(); "
+            "from sauna.experiments.bench.split import split; "
+            "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))")  # fmt: skip
+    command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(given), str(share)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def start_and_memory(given: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds from the command to the end of the first iteration, and the memory of one process.
+
+    A second run of the same settings, so that the compilation cache is warm. The first env step
+    comes before the first row does; the time told is the later one.
+    """
+    values = dict(given)
+    values["steps"] = resolve(values).rollout_steps * resolve(values).envs * 2
+    with tempfile.TemporaryDirectory() as folder:
+        settings = Path(folder) / "settings.json"
+        settings.write_text(json.dumps({**values, "out": os.path.join(folder, "run")}))
+        command = [sys.executable, "-m", "sauna", "train", "--config", str(settings)]
+        clock = time.time()
+        started = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        log = Path(folder) / "run" / "timing.jsonl"
+        peak = 0
+        while started.poll() is None:
+            peak = max(peak, _largest_worker(started.pid))
+            if not (log.exists() and log.read_text()):
+                first = time.time() - clock
+            time.sleep(0.02)
+        rows = [json.loads(line) for line in log.read_text().splitlines()]
+    return {
+        "seconds_to_first_row": first,
+        "seconds_to_first_env_step": first - rows[0]["seconds"],
+        "peak_memory_mib": peak / 1024,
+    }
+
+
+def _largest_worker(parent: int) -> int:
+    """KiB that the largest child of a process has held at its peak (Linux; elsewhere 0)."""
+    largest = 0
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            stat = (place / "stat").read_text().rpartition(")")[2].split()
+            if int(stat[1]) == parent:
+                status = (place / "status").read_text()
+                largest = max(largest, int(status.split("VmHWM:")[1].split()[0]))
+        except (OSError, IndexError):
+            continue  # it ended meanwhile
+    return largest
+
+
+def report(result: Mapping[str, Any]) -> list[str]:
+    """The figures as lines of text."""
+    rates, lines = result["rates"], []
+    middle = {name: sorted(values)[len(values) // 2] for name, values in rates.items()}
+    lines.append(
+        f"{result['env']}, {', '.join(result['arm'])}, {result['members']} members in "
+        f"{result['processes']} processes: {middle['training']:,.0f} env steps/s"
+    )
+    for name, found in result["ratios"].items():
+        text = f"{name} in as many processes"
+        if name == "physics":
+            text = simulator(result["env"]) or name
+        lines.append(
+            f"  {found['median']:.2f} times {text} ({found['low']:.2f} to {found['high']:.2f}; "
+            f"{middle[name]:,.0f} per second)"
+        )
+    total = sum(result["split"].values())
+    lines.append(f"  one process, {total:.1f} us per env step:")
+    for name, value in result["split"].items():
+        lines.append(f"    {name:14} {value:6.2f} us  {value / total:5.1%}")
+    records = sum(result["split"][name] for name in RECORDS) / total
+    lines.append(f"  of it for records and safety ({', '.join(RECORDS)}): {records:.1%}")
+    lines.append(
+        f"  first env step after {result['seconds_to_first_env_step']:.1f} s, at most "
+        f"{result['peak_memory_mib']:.0f} MiB in one process"
+    )
+    return lines

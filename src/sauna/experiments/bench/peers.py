@@ -1,0 +1,147 @@
+"""Other trainers to measure against, each in an environment of its own.
+
+Nothing of theirs is a dependency: a peer is installed into a folder of the user's cache the first
+time it is asked for, and run as a subprocess.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+from sauna.system.errors import BadInput, SaunaError
+
+# What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy.
+PEERS = {
+    "sb3": ["stable-baselines3==2.9.2", "gymnasium[mujoco]", "ale-py", "opencv-python-headless"],
+    "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
+}
+# CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
+_TORCH = (
+    ["torch", "--index-url", "https://download.pytorch.org/whl/cpu"],
+    ["torch==2.13.0"],
+)
+
+
+def cache_folder() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base) / "sauna"
+
+
+def prepare(peer: str, say: Callable[[str], None]) -> Path:
+    """The Python interpreter of a peer's environment, made if it is not there.
+
+    Raises:
+      BadInput: there is no such peer.
+      SaunaError: it cannot be installed; pip's last line says why.
+    """
+    if peer not in PEERS:
+        raise BadInput(f"against: unknown peer {peer!r} (known: {', '.join(PEERS)})")
+    folder = cache_folder() / "peers" / peer
+    python = folder / "bin" / "python"
+    done, wanted = folder / "complete", " ".join(PEERS[peer])
+    failed = None
+    if not done.exists():
+        say(f"installing {PEERS[peer][0]} and PyTorch (CPU) into {folder}, once")
+        venv.create(folder, with_pip=True, clear=True)
+        for attempt in _TORCH:
+            failed = _pip(python, attempt)
+            if failed is None:
+                break
+    if not done.exists() or done.read_text() != wanted:
+        failed = failed or _pip(python, PEERS[peer])
+        if failed is not None:
+            raise SaunaError(f"against: {peer} cannot be installed: {failed}")
+        done.write_text(wanted)
+    return python
+
+
+def _pip(python: Path, arguments: list[str]) -> str | None:
+    """Installs; what went wrong, or None."""
+    command = [str(python), "-m", "pip", "install", "--quiet", "--retries", "1", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
+    lines = done.stderr.strip().splitlines() or ["pip failed"]
+    return None if done.returncode == 0 else lines[-1]
+
+
+def peer_rate(
+    python: Path, script: Path | None, env: str, algorithm: str, processes: int, seconds: float
+) -> float:
+    """Env steps per second, summed over `processes` trainings that run at the same time.
+
+    Args:
+      script: CleanRL's `ppo_continuous_action.py`, or None for Stable-Baselines3.
+      algorithm: of Stable-Baselines3.
+
+    Raises:
+      SaunaError: one of them failed; its last line says why.
+    """
+    measure = partial(_sb3, algorithm) if script is None else partial(_cleanrl, script)
+    with ThreadPoolExecutor(processes) as pool:
+        rates = pool.map(lambda seed: measure(python, env, seed, seconds), range(processes))
+        return sum(rates)
+
+
+def _variables() -> dict[str, str]:
+    variables = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
+    variables.pop("PYTHONPATH", None)
+    return variables
+
+
+def _sb3(algorithm: str, python: Path, env: str, seed: int, seconds: float) -> float:
+    script = Path(__file__).with_name("peer_sb3.py")
+    command = [str(python), str(script), env, str(seed), str(seconds), algorithm]
+    with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it is started
+        done = subprocess.run(command, capture_output=True, text=True, env=_variables(), cwd=folder)
+    if done.returncode:
+        raise _failed(done.stderr, done.returncode)
+    return float(json.loads(done.stdout.splitlines()[-1])["rate"])
+
+
+def _cleanrl(script: Path, python: Path, env: str, seed: int, seconds: float) -> float:
+    """The script prints a line after each update; the first two are not counted."""
+    command = [str(python), "-u", str(script.resolve()), "--env-id", env, "--seed", str(seed)]
+    seen: list[float] = []
+    last = ""
+    with tempfile.TemporaryDirectory() as folder:
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
+            env=_variables(),
+        )  # fmt: skip
+        assert process.stdout is not None
+        for line in process.stdout:
+            last = line
+            if line.startswith("SPS:"):
+                seen.append(time.perf_counter())
+                if len(seen) >= 5 and seen[-1] - seen[2] > seconds:
+                    break
+        process.kill()
+        process.wait()
+    if len(seen) < 4:
+        raise _failed(last, process.returncode)
+    return 2048 * (len(seen) - 3) / (seen[-1] - seen[2])
+
+
+def _failed(errors: str, code: int) -> SaunaError:
+    lines = errors.strip().splitlines() or [f"exit code {code}"]
+    return SaunaError(f"against: the peer failed: {lines[-1]}")
+
+
+def versions(python: Path) -> dict[str, str]:
+    """Of what a peer's speed depends on."""
+    code = ("import importlib.metadata as m, json; "
+            "names = {d.name for d in m.distributions()}; "
+            "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy'); "
+            "print(json.dumps({n: m.version(n) for n in wanted if n in names}))")  # fmt: skip
+    command = [str(python), "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return {"python": sys.version.split()[0], **json.loads(done.stdout)}

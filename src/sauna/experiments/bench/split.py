@@ -1,0 +1,183 @@
+"""Where the time of one training process goes, by section.
+
+The pieces of the trainer are wrapped in timers; what the timers themselves cost is measured and
+taken off again.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import Program, make_program
+from sauna.algorithm.types import TrainState, member_keys
+from sauna.config.presets import members, resolve
+from sauna.envs.host import mujoco_tasks
+from sauna.envs.host.atari_envs import AtariEnvs
+from sauna.envs.host.mujoco_tasks import BatchTask
+from sauna.envs.probe import probe
+from sauna.system.checkpoint import save_checkpoint
+from sauna.training.loop import budget, host
+from sauna.training.loop.member_state import Counters
+from sauna.training.loop.metrics import metrics_row
+from sauna.training.prepare import settle
+
+SECTIONS = ("physics", "environment", "normalisation", "inference", "filter", "bookkeeping",
+            "update", "checks", "logging", "checkpoints")  # fmt: skip
+ITERATIONS = 6
+
+
+class Timers:
+    """Seconds spent in wrapped functions, by section; nested ones are taken off the outer."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(SECTIONS, 0.0)
+        self.calls = 0
+        self._inside: list[float] = []
+        self._cost = 0.0
+
+    def wrap(self, section: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **named: Any) -> Any:
+            self._inside.append(0.0)
+            clock = time.perf_counter()
+            result = function(*arguments, **named)
+            spent = time.perf_counter() - clock
+            self.seconds[section] += spent - self._inside.pop()
+            if self._inside:
+                self._inside[-1] += spent + self._cost
+            self.calls += 1
+            return result
+
+        return timed
+
+    def calibrate(self) -> float:
+        """Measures what one wrapped call costs beyond the function, in seconds."""
+        timed, number = self.wrap("physics", lambda: None), 20_000
+        clock = time.perf_counter()
+        for _ in range(number):
+            timed()
+        self._cost = (time.perf_counter() - clock - self.seconds["physics"]) / number
+        return self._cost
+
+
+def split(settings: dict[str, Any], count: int) -> dict[str, float]:
+    """Microseconds per env step in each section, for `count` members in this process."""
+    given = {**settings, "seeds": count, "processes": 1}
+    config = resolve(given)
+    kwargs = json.loads(config.env_kwargs)
+    found = probe(config.env, kwargs)
+    config = settle(config, found.spaces)
+    job = host.Job(config, found.spaces, kwargs, members(config, given), [], None, 0, True)
+    timers = Timers()
+    cost = timers.calibrate()
+    program = _timed(make_program(config, found.spaces), timers)
+    envs = host.make_envs(job)
+    keys = [member_keys(member.seed) for member in job.members]
+    collector = HostCollector(program, found.spaces, envs, keys)
+    restore = _wrap_host(collector, envs, timers)
+    try:
+        steps, seconds, states, counters = _train(job, program, collector, timers)
+        saving = _checkpoint_seconds(job, program, collector, states, counters)
+    finally:
+        restore()
+        envs.close()
+    rest = seconds - sum(timers.seconds.values()) - timers.calls * cost
+    timers.seconds["bookkeeping"] += max(rest, 0.0)
+    timers.seconds["checkpoints"] = saving * ITERATIONS / config.checkpoint_every
+    return {name: 1e6 * timers.seconds[name] / steps for name in SECTIONS}
+
+
+def _timed(program: Program, timers: Timers) -> Program:
+    """The program with timers around what the host calls."""
+
+    def waiting(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *arguments: jax.block_until_ready(function(*arguments))
+
+    sections = {"draw": "inference", "act": "inference", "score": "inference",
+                "value": "inference", "make_batch": "update", "learn": "update"}  # fmt: skip
+    wrapped: dict[str, Any] = {
+        name: timers.wrap(section, waiting(getattr(program, name)))
+        for name, section in sections.items()
+    }
+    if program.filter is not None:
+        wrapped["decide"] = timers.wrap("filter", waiting(program.decide))
+    return program._replace(**wrapped)
+
+
+def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
+    """Puts timers around acting, normalising and stepping; returns what takes the physics' off."""
+    actor, moments = collector._actor, collector.observation_moments
+    actor.act = timers.wrap("inference", actor.act)
+    if moments is not None:
+        moments.see_and_normalize = timers.wrap("normalisation", moments.see_and_normalize)
+    envs.step = timers.wrap("environment", envs.step)
+    if hasattr(envs, "_is_finite"):
+        envs._is_finite = timers.wrap("checks", envs._is_finite)
+    where, name = _physics(envs)
+    plain = getattr(where, name)
+    setattr(where, name, timers.wrap("physics", plain))
+    return lambda: setattr(where, name, plain)
+
+
+def _physics(envs: Any) -> tuple[Any, str]:
+    """Where the simulator is stepped here: a module or an object, and a function's name."""
+    if isinstance(envs, AtariEnvs):
+        return envs, "_take"
+    if isinstance(getattr(envs, "_task", None), BatchTask):
+        return mujoco_tasks, "_advance"
+    return mujoco, "mj_step"
+
+
+def _train(
+    job: host.Job, program: Program, collector: HostCollector, timers: Timers
+) -> tuple[int, float, list[TrainState], list[Counters]]:
+    """Env steps and seconds of some iterations after two that are not counted; how they ended."""
+    keys = [member_keys(member.seed) for member in job.members]
+    states = [program.init(k.init) for k in keys]
+    counters = [Counters() for _ in keys]
+    collector.start()
+    log = timers.wrap("logging", lambda *row: json.dumps(metrics_row(*row), allow_nan=False))
+    steps, clock = 0, 0.0
+    for iteration in range(2 + ITERATIONS):
+        if iteration == 2:
+            steps, clock, timers.calls = 0, time.perf_counter(), 0
+            timers.seconds = dict.fromkeys(SECTIONS, 0.0)
+        hypers = [budget.hypers_of(job, p, counters[p], iteration) for p in range(len(keys))]
+        limit = np.array([budget.step_limit(job.config, c) for c in counters])
+        params = np.stack([np.asarray(state.params) for state in states])
+        collected = collector.collect(params, hypers, iteration, limit)
+        for p, member in enumerate(job.members):
+            order = minibatch_order(job.config, member.seed, iteration)
+            states[p], learned = host._learn(program, states[p], collected[p], hypers[p], order)
+            counters[p].add(collected[p])
+            steps += collected[p].env_steps
+            log(member, job.config, iteration, collected[p], counters[p], learned, hypers[p])
+    return steps, time.perf_counter() - clock, states, counters
+
+
+def _checkpoint_seconds(
+    job: host.Job,
+    program: Program,
+    collector: HostCollector,
+    states: list[TrainState],
+    counters: list[Counters],
+) -> float:
+    """Seconds that one checkpoint takes: gathering, hashing, writing, flushing to disk."""
+    seconds = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(3):
+            clock = time.perf_counter()
+            arrays = host._pack(program, job.members, states, counters, collector, collector._envs)
+            save_checkpoint(Path(folder), number, arrays, {}, keep=2)
+            seconds.append(time.perf_counter() - clock)
+    return sorted(seconds)[1]

@@ -1,0 +1,1 @@
+"""A trained policy: read from a run, and played."""

@@ -1,0 +1,71 @@
+"""What a finished run offers: its newest good checkpoint and what that is of. No JAX here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sauna.config.presets import stored_config
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces, describe, read_spaces
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput, nearest
+
+
+class Artifact(NamedTuple):
+    """A checkpoint of a run and what it is of."""
+
+    config: Config
+    spaces: Spaces
+    members: list[str]
+    checkpoint: checkpoint.Checkpoint
+
+
+def load_artifact(
+    run: Path, warn: Callable[[str], None] = print, iteration: int | None = None
+) -> Artifact:
+    """Reads a run's newest good checkpoint, or the one of an iteration.
+
+    Raises:
+      BadInput: no run there, or no checkpoint yet.
+      BadCheckpoint: none of its checkpoints can be trusted.
+    """
+    run_directory.read_config(run)
+    if iteration is None:
+        loaded = checkpoint.load_newest(run / "checkpoints", warn)
+    else:
+        loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
+    if loaded is None:
+        raise BadInput(f"{run} has no checkpoint yet")
+    try:
+        spaces = read_spaces(loaded.manifest["spaces"])
+    except (TypeError, ValueError, LookupError) as error:
+        raise checkpoint.BadCheckpoint(f"{loaded.path}: its spaces cannot be read") from error
+    config = stored_config(loaded.manifest["config"])
+    return Artifact(config, spaces, loaded.manifest["members"], loaded)
+
+
+def find_member(members: list[str], member: str | int) -> str:
+    if isinstance(member, int) or member.isdigit():
+        index = int(member)
+        if not 0 <= index < len(members):
+            raise BadInput(f"member: {index} is not between 0 and {len(members) - 1}")
+        return members[index]
+    if member not in members:
+        raise BadInput(f"member: unknown member {member!r}{nearest(member, members)}")
+    return member
+
+
+def check_spaces(artifact: Artifact, env: Any) -> None:
+    """Refuses an environment whose spaces are not the run's.
+
+    Raises:
+      BadInput: naming the space that differs.
+    """
+    found = describe(env.observation_space, env.action_space)
+    for part in ("observation_text", "action_text"):
+        ours, theirs = getattr(artifact.spaces, part), getattr(found, part)
+        if ours != theirs:
+            kind = part.split("_")[0]
+            raise BadInput(f"env: the run's {kind} space is {ours}, this environment's {theirs}")

@@ -1,0 +1,54 @@
+"""`sauna inspect`: one page about what a trained policy meets, and what the filter makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sauna.experiments.evaluate.artifact import find_member, load_artifact
+from sauna.system.errors import BadInput
+
+
+def inspect(
+    run: str | Path,
+    *,
+    member: str | int | None = None,
+    episodes: int = 1,
+    deterministic: bool = False,
+    seed: int = 0,
+    out: str | Path | None = None,
+    pictures: bool = True,
+    say: Callable[[str], None] = print,
+) -> Path:
+    """Plays episodes with a member's policy and writes one self-contained page about them.
+
+    Args:
+      run: the run directory.
+      member: name or index; default the first.
+      episodes: played one after the other, with seeds `seed`, `seed + 1`, ...
+      deterministic: the distribution's mode; otherwise actions are sampled, as in training.
+      out: the page; default `RUN/inspect_MEMBER_MODE.html`.
+      pictures: draw the environment; where that fails, one line says so and the page has none.
+      say: is told of checkpoints that cannot be trusted, and of missing pictures.
+
+    Returns:
+      the page.
+
+    Raises:
+      BadInput: no such run or member, impossible numbers, or a page that cannot be put there.
+    """
+    run = Path(run)
+    if episodes < 1 or seed < 0:
+        raise BadInput("episodes: must be at least 1, and seed at least 0")
+    artifact = load_artifact(run, say)
+    name = find_member(artifact.members, 0 if member is None else member)
+    mode = "deterministic" if deterministic else "sampled"
+    path = Path(out) if out else run / f"inspect_{name.replace('/', '-')}_{mode}.html"
+    if path.is_dir() or not path.parent.is_dir():
+        raise BadInput(f"out: {path} is a folder, or not in one")
+    from sauna.experiments.inspect.inspection import examine  # imports JAX, so after the checks
+    from sauna.experiments.inspect.page import make_page
+
+    found = examine(run, artifact, name, episodes, deterministic, seed, pictures, say)
+    path.write_text(make_page(found, run), encoding="utf-8")
+    return path

@@ -1,0 +1,264 @@
+"""Is the threshold a dial between exploration and exploitation? What `sauna study dial` says of it.
+
+Three things are set against the threshold: the policy's entropy (mean over training), its state
+coverage (mean over the checkpoints) and the final return, each one number per member. Whether one
+of them follows a constant threshold is asked by rank correlation over members; its p value is that
+of dealing the members' thresholds out at random, corrected by Holm's method for the three
+quantities of a task. A filter that drops more also updates less often in the same env steps: arms
+that drop as much by coin say how much of an effect that is. A coin's member repeats the drop rates
+of one member of the filter, so these are compared pair by pair, by Student's t.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+
+from sauna.experiments.measure.noise_report import shown
+from sauna.experiments.report import style
+from sauna.experiments.report.figures import Extra, Line, Panel, Plot
+from sauna.experiments.report.tables import table
+from sauna.experiments.statistics import ALPHA, SEED, Estimate, holm, mean_interval
+
+TITLE = "Is the threshold a dial between exploration and exploitation?"
+DEALS = 10_000
+# key of a member's number, what it is called, title, caption
+QUANTITIES = (
+    ("keep_rate", "keep rate", "Keep rate", "Share of all env steps that updates learned from."),
+    ("entropy", "entropy", "Policy entropy", "In nats, mean over training."),
+    ("coverage", "coverage", "State coverage", "Entropy of the visited observations in nats, by "
+     "nearest neighbours, in one scale for all arms; mean over the checkpoints."),
+    ("final_return", "return", "Final return", "Training return, mean of the last 100 episodes."),
+)  # fmt: skip
+ASKED = ("entropy", "coverage", "final_return")
+ABOUT = (
+    "Against the threshold: keep rate, entropy of the policy, coverage of states, return. Of arms "
+    "whose threshold moves its median over training is shown. Rank correlations are over members "
+    "of arms with a constant threshold, p by dealing their thresholds out at random, after Holm's "
+    "correction for the three quantities of a task. Fewer kept steps are also fewer updates in the "
+    "same env steps: arms that drop as much by coin show what that alone does. Differences from a "
+    "coin are means over pairs of members with the same drop rates; in brackets 95%, not corrected "
+    "for their number."
+)
+LOOKS = {"constant": "sauna", "scheduled": "vex-head", "held keep rate": "ppo",
+         "coin, dropping as much": "random-drop"}  # fmt: skip
+
+
+class Mark(NamedTuple):
+    """One arm on one task: where it stands, and its members' numbers."""
+
+    kind: str  # of `LOOKS`
+    label: str
+    threshold: float  # of a coin, that of the arm whose rates it repeats
+    seeds: int  # that the arm has, trained and measured or not
+    members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
+    drops_like: str | None = None  # of a coin, the arm whose drop rates it repeats
+
+
+def extra(measured: Mapping[str, Any]) -> Extra:
+    """The section and the figures that the study's page gets."""
+    head, *rows = text_table(measured)
+    html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
+    html += table(head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
+                  name="Threshold, exploration and return")  # fmt: skip
+    return Extra(TITLE, html, plots(measured), looks())
+
+
+def looks() -> dict[str, style.Look]:
+    return dict(zip(LOOKS, style.looks({a: a for a in LOOKS.values()}).values(), strict=True))
+
+
+def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
+    """Every arm of a task whose threshold is known, in the order of the study.
+
+    Of members that are measured: all of an arm's numbers are of the same ones.
+    """
+    cells = [cell for cell in measured["cells"] if cell["task"] == task]
+    thresholds = {cell["label"]: _threshold(cell) for cell in cells}
+    found = []
+    for cell in cells:
+        numbers = {
+            key: [(m["seed"], float(value)) for m in cell["members"]
+                  if m["points"] and (value := _number(m, key)) is not None]
+            for key, *_ in QUANTITIES
+        }  # fmt: skip
+        kind = _kind(cell)
+        stands_for = cell["rates_of"] if kind.startswith("coin") else cell["label"]
+        threshold = thresholds.get(stands_for)
+        if threshold is not None:
+            found.append(
+                Mark(kind, cell["label"], threshold, cell["seeds"], numbers, cell["rates_of"])
+            )
+    return found
+
+
+def _threshold(cell: Mapping[str, Any]) -> float | None:
+    """An arm's own: where it moves, the mean over members of its median over training."""
+    if _kind(cell) == "constant":
+        return float(cell["config"]["threshold"])
+    moved = [m["threshold"] for m in cell["members"] if m.get("threshold") is not None]
+    return float(np.mean(moved)) if moved else None
+
+
+def _kind(cell: Mapping[str, Any]) -> str:
+    config = cell["config"]
+    if cell["arm"] == "random-drop":
+        return "coin, dropping as much"
+    if config["keep_rate_target"]:
+        return "held keep rate"
+    return "constant" if config["threshold_schedule"] == "constant" else "scheduled"
+
+
+def _number(member: Mapping[str, Any], key: str) -> float | None:
+    if key == "coverage":
+        values = [point["coverage"] for point in member["points"]]
+        return float(np.mean(values)) if values else None
+    return member.get(key)
+
+
+def tasks_of(measured: Mapping[str, Any]) -> list[str]:
+    return list(dict.fromkeys(cell["task"] for cell in measured["cells"]))
+
+
+def over_members(mark: Mark, key: str) -> Estimate:
+    """Mean over members, and Student's t interval."""
+    values = np.array([value for _, value in mark.members[key]])
+    if len(values) < 2:
+        return Estimate(float(values[0]) if len(values) else None, None, None)
+    return Estimate(*(float(x[0]) for x in mean_interval(values[:, None])))
+
+
+def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
+    """The head, and a row for each task and arm."""
+    names = [title for _, _, title, _ in QUANTITIES]
+    rows = [["Task", "Arm", "Members", "Threshold", *names]]
+    for task in tasks_of(measured):
+        for mark in marks(measured, task):
+            number = f"{len(mark.members['coverage'])} of {mark.seeds}"
+            values = [shown(over_members(mark, key)) for key, *_ in QUANTITIES]
+            rows.append([task, mark.label, number, f"{mark.threshold:.3g}", *values])
+    return rows
+
+
+def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | None:
+    """Rank correlation with a constant threshold, its p value, and the number of members.
+
+    None where there are fewer than three thresholds. What is the same for all follows nothing.
+    """
+    pairs = [(m.threshold, value) for m in found if m.kind == "constant"
+             for _, value in m.members[key]]  # fmt: skip
+    if len({threshold for threshold, _ in pairs}) < 3:
+        return None
+    if len({value for _, value in pairs}) < 2:
+        return 0.0, 1.0, len(pairs)
+    x, y = (scipy.stats.rankdata(column) for column in zip(*pairs, strict=True))
+    x, y = x - x.mean(), y - y.mean()
+    rho = float(x @ y / np.sqrt((x @ x) * (y @ y)))
+    random = np.random.default_rng(SEED)
+    dealt = np.abs(random.permuted(np.tile(x, (DEALS, 1)), axis=1) @ y)
+    p = (1 + int((dealt >= abs(x @ y) * (1 - 1e-12)).sum())) / (1 + DEALS)
+    return rho, p, len(pairs)
+
+
+def verdicts(measured: Mapping[str, Any]) -> list[str]:
+    """The answer for each task, in sentences that claim no more than their tests."""
+    return [said for task in tasks_of(measured) if (found := marks(measured, task))
+            for said in (_verdict(task, found), *_beside_coins(task, found))]  # fmt: skip
+
+
+def beside_coin(arm: Mark, coin: Mark, key: str) -> Estimate:
+    """Mean over the seeds that both have of arm minus coin, and its interval."""
+    own, other = dict(arm.members[key]), dict(coin.members[key])
+    pairs = [(seed, own[seed] - other[seed]) for seed in own if seed in other]
+    return over_members(arm._replace(members={key: pairs}), key)
+
+
+def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
+    """Whether an arm does what a coin that drops as much does as well: a sentence for each coin."""
+    arms = {mark.label: mark for mark in found}
+    for coin in found:
+        if coin.drops_like not in arms:
+            continue
+        pairs = len({seed for seed, _ in arms[coin.drops_like].members["coverage"]}
+                    & {seed for seed, _ in coin.members["coverage"]})  # fmt: skip
+        if pairs < 2:
+            yield f"{task}: threshold {coin.drops_like} and a coin that drops as much have too " \
+                  f"few pairs yet."  # fmt: skip
+            continue
+        said, apart = [], []
+        for key, name, *_ in QUANTITIES:
+            if key in ASKED:
+                value, low, high = beside_coin(arms[coin.drops_like], coin, key)
+                said.append(f"{name} {shown(Estimate(value, low, high))}")
+                if low is not None and high is not None and not low <= 0 <= high:
+                    apart.append(name)
+        kind = f"told apart by {' and '.join(apart)}" if apart else "not told apart"
+        yield f"{task}: threshold {coin.drops_like} and a coin that drops as much are {kind} " \
+              f"(threshold minus coin: {', '.join(said)}; {pairs} pairs)."  # fmt: skip
+
+
+def _verdict(task: str, found: Sequence[Mark]) -> str:
+    results = {key: correlation(found, key) for key in ASKED}
+    known = {key: result for key, result in results.items() if result is not None}
+    if set(known) != set(ASKED):
+        return f"{task}: no answer yet; too few members of different thresholds are measured."
+    corrected = dict(zip(ASKED, holm([known[key][1] for key in ASKED]), strict=True))
+    follows = {key: np.sign(known[key][0]) if corrected[key] < ALPHA else 0 for key in ASKED}
+    said = []
+    for key, name, *_ in QUANTITIES:
+        if key in known:
+            word = {1: "rises", -1: "falls", 0: "does not follow"}[int(follows[key])]
+            p = "< 0.001" if corrected[key] < 0.001 else f"= {corrected[key]:.3f}"
+            said.append(f"{name} {word} (rank correlation {known[key][0]:.2f}, p {p})")
+    explores = {follows["entropy"], follows["coverage"]}
+    if explores in ({1}, {-1}):
+        dial = "the threshold moves exploration"
+        if follows["final_return"] == -follows["entropy"]:
+            dial += " against return, as a dial between the two would"
+        elif follows["final_return"]:
+            dial += " and return the same way"
+        else:
+            dial += ", with no evidence that return follows"
+    else:
+        dial = "no evidence that the threshold is a dial of exploration: entropy and coverage do " \
+               "not both follow it one way"  # fmt: skip
+    coins = any(mark.drops_like for mark in found)
+    if explores in ({1}, {-1}) and coins:
+        dial += " (what fewer updates alone do, the coins say)"
+    number, wanted = known["coverage"][2], sum(m.seeds for m in found if m.kind == "constant")
+    so_far = "" if number == wanted else f" of {wanted} so far"
+    return f"{task}: {dial}. With a rising threshold {'; '.join(said)}; {number} members{so_far}."
+
+
+def plots(measured: Mapping[str, Any]) -> list[Plot]:
+    """Each quantity against the threshold, a panel for each task."""
+    found = {task: marks(measured, task) for task in tasks_of(measured)}
+    drawn = []
+    for key, name, title, caption in QUANTITIES:
+        panels = [Panel(task, _lines(own, key)) for task, own in found.items()]
+        limits = (0.0, 1.0) if key == "keep_rate" else None
+        text = f"{caption} Point: mean of the members; band: 95% interval."
+        plot = Plot(f"dial_{key}", title, text, "threshold", name, limits, panels)
+        if any(panel.lines for panel in panels):
+            drawn.append(plot)
+    return drawn
+
+
+def _lines(found: Sequence[Mark], key: str) -> list[Line]:
+    """A line for each kind of arm, its arms in the order of their thresholds."""
+    lines = []
+    for kind in LOOKS:
+        own = sorted((m for m in found if m.kind == kind and m.members[key]),
+                     key=lambda m: m.threshold)  # fmt: skip
+        if not own:
+            continue
+        x: list[float | None] = [mark.threshold for mark in own]
+        y, low, high = map(list, zip(*(over_members(mark, key) for mark in own), strict=True))
+        seeds = sorted({seed for mark in own for seed, _ in mark.members[key]})
+        each = [(seed, x, [dict(mark.members[key]).get(seed) for mark in own]) for seed in seeds]
+        lines.append(Line(kind, x, y, low, high, each))
+    return lines

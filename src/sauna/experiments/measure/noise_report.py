@@ -1,0 +1,255 @@
+"""Is what the filter drops noisier than what a coin drops? What `sauna study noise` says of it.
+
+Noise has two measures here. Signal to noise is with advantages as in training. Variance is with
+advantages as they are: to standardise those of a minibatch of dropped steps would divide out what
+makes them noisy, and training never has such a minibatch.
+
+Every number is of one member first: the mean over its checkpoints (of ratios of variances the
+geometric mean). Intervals are Student's t over members, because checkpoints and minibatches of one
+training are not independent of each other. The bootstrap intervals of single checkpoints are in the
+result file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from sauna.experiments.report import style
+from sauna.experiments.report.figures import Extra, Line, Panel, Plot
+from sauna.experiments.report.numbers import interval
+from sauna.experiments.report.tables import table
+from sauna.experiments.statistics import Estimate, mean_interval
+
+GROUPS = ("kept", "dropped", "coin", "shifted")
+TITLE = "Is what the filter drops noisier than what a coin drops?"
+ABOUT = (
+    "At checkpoints along training, with policy, head and normaliser as they stood: the "
+    "policy gradient of minibatches of kept steps, of dropped ones, of steps that a coin kept, and "
+    "of steps dropped by the filter's decisions moved in time (shifted: as many, and as bunched). "
+    "Signal to noise is the squared length of a group's mean gradient over the trace of its "
+    "covariance, for one minibatch; variance is that trace, in the table one group's over "
+    "another's. Advantages are standardised in each minibatch as in training, except where raw is "
+    "said: of steps with large advantages both signal and variance are large then, and the one can "
+    "rise without the other. Cosine is that of a minibatch's gradient and of a large independent "
+    "batch of all steps. Alignment is the cosine with endless minibatches: below 1 where the "
+    "group's gradient is biased, not only noisy; it is known only at checkpoints with a signal "
+    "that can be told from none (how many stands behind it), and its estimates go above 1. In "
+    "brackets: 95% over members, each the mean of its checkpoints; not corrected for the number of "
+    "comparisons."
+)
+# key in the figures, title, caption, y axis, its limits
+_PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
+    ("snr", "Signal to noise of a minibatch", "Squared length of the group's mean gradient over "
+     "the trace of its covariance.", "signal to noise", None),
+    ("cosine", "Cosine to the gradient of a large batch", "Mean cosine of a minibatch's gradient "
+     "and that of all steps of an independent large batch.", "cosine", (-1.0, 1.0)),
+    ("variance", "Variance of a minibatch's gradient beside a coin's", "Trace of the group's "
+     "covariance over that of what a coin keeps, advantages raw; means are geometric.",
+     "of a coin's variance", None),
+)  # fmt: skip
+HEAD = ("Task", "Arm", "Members", "Keep rate", "SNR kept", "SNR coin", "SNR dropped",
+        "SNR dropped - coin", "SNR dropped - shifted", "SNR per env step, kept - coin",
+        "Cosine dropped - coin", "Alignment of kept", "Variance, kept / coin",
+        "Raw variance, kept / coin", "Raw variance, dropped / coin",
+        "Raw variance, dropped / shifted")  # fmt: skip
+
+
+def extra(measured: Mapping[str, Any]) -> Extra:
+    """The section and the figures that the study's page gets."""
+    head, *rows = text_table(measured)
+    html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
+    html += table(head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
+                  name="Noise of minibatch gradients")  # fmt: skip
+    return Extra(TITLE, html, plots(measured), looks())
+
+
+def looks() -> dict[str, style.Look]:
+    """A colour for each group of steps."""
+    arms = {"kept": "sauna", "dropped": "vex-head", "coin": "random-drop", "shifted": "ppo"}
+    return dict(zip(arms, style.looks({arm: arm for arm in arms.values()}).values(), strict=True))
+
+
+def rule(point: Mapping[str, Any], raw: bool = False) -> Mapping[str, Any] | None:
+    """A checkpoint's estimates, advantages as in training or `raw`.
+
+    None where too little was dropped.
+    """
+    return point["rules"].get("raw" if raw else point["as_trained"])
+
+
+def over_members(cell: Mapping[str, Any], *path: str, raw: bool = False) -> Estimate:
+    """Mean over members of their means over checkpoints, and its interval; geometric of ratios.
+
+    Args:
+      path: of the value in a checkpoint's estimates.
+    """
+    ratio = path[-1] == "variance_ratio"
+    means: list[float] = []
+    for member in cell["members"]:
+        found = (_value(point, path, raw) for point in member["points"])
+        values = [value for value in found if value is not None]
+        if values:
+            means.append(_mean(values, geometric=ratio)[0])
+    if not means:
+        return Estimate(None, None, None)
+    mean, low, high = _mean(means, geometric=ratio)
+    return Estimate(mean, None, None) if len(means) < 2 else Estimate(mean, low, high)
+
+
+def _value(point: Mapping[str, Any], path: Sequence[str], raw: bool = False) -> float | None:
+    found: Any = rule(point, raw)
+    for key in path:
+        found = None if found is None else found[key]
+    return None if found is None else found[0]
+
+
+def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
+    """The head, and a row for each task and arm."""
+    rows = [list(HEAD)]
+    for cell in measured["cells"]:
+        rates = [point["keep_rate"] for point in _points(cell)]
+        used = sum(any(rule(p) for p in m["points"]) for m in cell["members"])
+        values = [
+            *(over_members(cell, "groups", name, "snr") for name in ("kept", "coin", "dropped")),
+            over_members(cell, "differences", "dropped - coin", "snr"),
+            over_members(cell, "differences", "dropped - shifted", "snr"),
+            over_members(cell, "differences", "kept - coin", "snr_per_env_step"),
+            over_members(cell, "differences", "dropped - coin", "cosine"),
+        ]
+        ratios = [
+            _ratio(cell, "kept - coin"),
+            *(_ratio(cell, pair, raw=True)
+              for pair in ("kept - coin", "dropped - coin", "dropped - shifted")),
+        ]  # fmt: skip
+        rate = f"{np.mean(rates):.2f}" if rates else "-"
+        rows.append([cell["task"], cell["label"], f"{used} of {cell['seeds']}", rate,
+                     *map(shown, values), _alignment(cell), *map(shown_ratio, ratios)])  # fmt: skip
+    return rows
+
+
+def _ratio(cell: Mapping[str, Any], pair: str, raw: bool = False) -> Estimate:
+    return over_members(cell, "differences", pair, "variance_ratio", raw=raw)
+
+
+def _alignment(cell: Mapping[str, Any]) -> str:
+    """That of the kept, and at how many of the measured checkpoints it is known."""
+    path = ("groups", "kept", "alignment")
+    values = [_value(point, path) for point in _points(cell) if rule(point)]
+    known = sum(value is not None for value in values)
+    return f"{shown(over_members(cell, *path))}, {known} of {len(values)}"
+
+
+def shown_ratio(estimate: Estimate) -> str:
+    """Three decimals where it is about 1, else as `shown`."""
+    near = estimate.high is not None and 0.5 < estimate.high < 2
+    return interval(estimate, 3) if near else shown(estimate)
+
+
+def shown(estimate: Estimate) -> str:
+    """Two significant digits of the value, and its interval to the same place."""
+    value, low, high = estimate
+    if value is None:
+        return "-"
+    largest = max(abs(x) for x in estimate if x is not None)
+    digits = max(0, 1 - int(np.floor(np.log10(largest)))) if largest else 0
+    if low is None or high is None:
+        return f"{value:.{digits}f}"
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def verdicts(measured: Mapping[str, Any]) -> list[str]:
+    """The answer for each task and arm, in a sentence that claims no more than its interval."""
+    return [_verdict(cell) for cell in measured["cells"]]
+
+
+def _verdict(cell: Mapping[str, Any]) -> str:
+    points = [*_points(cell)]
+    measured = [point for point in points if rule(point)]
+    where = f"{cell['task']}, {cell['label']}"
+    if not points:
+        return f"{where}: not measured yet."
+    if not measured:
+        return (f"{where}: no answer, because the filter dropped too few steps at each of "
+                f"{len(points)} checkpoints.")  # fmt: skip
+    difference = over_members(cell, "differences", "dropped - coin", "snr")
+    dropped, coin = (over_members(cell, "groups", name, "snr") for name in ("dropped", "coin"))
+    ratio, kept = _ratio(cell, "dropped - coin", raw=True), _ratio(cell, "kept - coin")
+    means = [shown(Estimate(found.value, None, None)) for found in (dropped, coin)]
+    text = (
+        f"{where}: by variance what the filter drops {_kind(ratio, 1.0, noisier=1)} what a coin "
+        f"drops ({shown_ratio(ratio)} times a coin's, advantages raw); by signal to noise it "
+        f"{_kind(difference, 0.0, noisier=-1)} that ({means[0]} against {means[1]} per minibatch "
+        f"of {measured[0]['minibatch']}, difference {shown(difference)}). As trained, minibatches "
+        f"of what it keeps have {shown_ratio(kept)} times the variance of a coin's."
+    )
+    if len(measured) < len(points):
+        text += (
+            f" At {len(points) - len(measured)} of {len(points)} checkpoints it dropped too few."
+        )
+    number = sum(bool(member["points"]) for member in cell["members"])
+    return text if number == cell["seeds"] else f"{text} {number} of {cell['seeds']} seeds so far."
+
+
+def _kind(estimate: Estimate, equal: float, noisier: int) -> str:
+    """What an interval says of the dropped; `noisier` is the side of `equal` that means it."""
+    if estimate.low is None or estimate.high is None:
+        return "is of too few members to be told from"
+    if estimate.low <= equal <= estimate.high:
+        return "is not told from"
+    return "is noisier than" if (estimate.low > equal) == (noisier > 0) else "is less noisy than"
+
+
+def plots(measured: Mapping[str, Any]) -> list[Plot]:
+    """Each group along training, a panel for each task and arm."""
+    cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
+    found = []
+    for key, title, caption, label, limits in _PLOTS:
+        panels = [
+            Panel(f"{cell['task']}, {cell['label']}", [_line(cell, g, key) for g in GROUPS])
+            for cell in cells
+        ]
+        text = f"{caption} Line: mean of the members; band: 95% interval."
+        found.append(Plot(f"noise_{key}", title, text, "env steps", label, limits, panels))
+    return found if cells else []
+
+
+def _points(cell: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
+    return (point for member in cell["members"] for point in member["points"])
+
+
+def _line(cell: Mapping[str, Any], group: str, key: str) -> Line:
+    """One group's line through the points along training."""
+    seeds = []
+    at: dict[float, list[float]] = {}
+    for member in cell["members"]:
+        values = {point["point"]: _drawn(point, group, key) for point in member["points"]}
+        seeds.append((member["seed"], [x * cell["steps"] for x in values], [*values.values()]))
+        for x, value in values.items():
+            if value is not None:
+                at.setdefault(x, []).append(value)
+    x = sorted(at)
+    lines = [_mean(at[point], geometric=key == "variance") for point in x]
+    y, low, high = (
+        [None if np.isnan(value) else value for value in column]
+        for column in zip(*lines, strict=True)
+    )
+    return Line(group, [point * cell["steps"] for point in x], y, low, high, seeds)
+
+
+def _drawn(point: Mapping[str, Any], group: str, key: str) -> float | None:
+    """What a figure shows of a group at a checkpoint: of its variance the ratio to the coin's."""
+    if key != "variance":
+        return _value(point, ("groups", group, key))
+    own, coin = (_value(point, ("groups", name, key), raw=True) for name in (group, "coin"))
+    return None if own is None or coin is None else own / coin
+
+
+def _mean(values: Sequence[float], geometric: bool) -> list[float]:
+    """The mean and its interval, NaN where there is none."""
+    x = np.log(values) if geometric else np.asarray(values)
+    ends = [float(end[0]) for end in mean_interval(x[:, None])]
+    return [float(np.exp(end)) for end in ends] if geometric else ends

@@ -1,0 +1,232 @@
+"""The figures of a study: what each one shows, and its PNG and SVG files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import fill
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sauna.experiments.report import style
+
+Numbers = list[float | None]
+COLUMNS = 3  # panels side by side
+WRAP = 38  # characters of a name in one line
+
+
+@dataclass(frozen=True)
+class Line:
+    """One label in one panel; `seeds` are the `(seed, x, y)` it was computed from."""
+
+    label: str
+    x: Numbers
+    y: Numbers
+    low: Numbers
+    high: Numbers
+    seeds: list[tuple[int, Numbers, Numbers]]
+
+
+@dataclass(frozen=True)
+class Panel:
+    task: str
+    lines: list[Line]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """One figure: a panel for each task. The y axis never leaves `limits`, where they are given."""
+
+    name: str
+    title: str
+    caption: str
+    x_label: str
+    y_label: str
+    limits: tuple[float, float] | None
+    panels: list[Panel]
+
+
+class Extra(NamedTuple):
+    """What a measurement adds to the page and the figures of a study."""
+
+    title: str
+    html: str
+    plots: Sequence[Plot]
+    looks: Mapping[str, style.Look]
+
+
+NOTHING = Extra("", "", (), {})
+
+# name of the file, key in the curves, title, caption, y axis, its limits
+_CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] = (
+    (
+        "learning_curves",
+        "return_mean",
+        "Learning curves",
+        "Training return, mean of the last 100 episodes. Line: mean of the seeds; band: 95% "
+        "interval.",
+        "return",
+        None,
+    ),
+    (
+        "keep_rate",
+        "keep_rate",
+        "Keep rate",
+        "Share of the env steps that the update learned from; 1 where nothing is dropped.",
+        "kept",
+        (0.0, 1.0),
+    ),
+    (
+        "vex",
+        "vex_mean",
+        "Vex",
+        "What the Vex head predicts, mean over all env steps. The axis is cut at -1.",
+        "Vex",
+        (-1.0, 1.0),
+    ),
+    (
+        "explained_variance",
+        "explained_variance",
+        "Explained variance",
+        "Share of the returns' variance that the value function explains, over the env steps that "
+        "the update learned from, which a filter chooses. The axis is cut at -1.",
+        "explained variance",
+        (-1.0, 1.0),
+    ),
+)
+
+
+def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plot]:
+    """Every figure that has something to show."""
+    plots = [
+        Plot(name, title, caption, "env steps", y_label, limits,
+             _curve_panels(results, summary, metric))
+        for name, metric, title, caption, y_label, limits in _CURVES
+    ]  # fmt: skip
+    caption = ("Share of the seeds whose final return is at least x; band: 95% interval, which has "
+               "no width where all seeds or none reach x, and is no certainty there.")  # fmt: skip
+    plots.append(
+        Plot("profiles", "Performance profiles", caption, "final return", "share of seeds",
+             (0.0, 1.0), _profile_panels(summary))
+    )  # fmt: skip
+    return [plot for plot in plots if any(panel.lines for panel in plot.panels)]
+
+
+def looks_of(results: Mapping[str, Any]) -> dict[str, style.Look]:
+    """The look of each label of a study, in the order of its cells."""
+    return style.looks({cell["label"]: cell["arm"] for cell in results["cells"]})
+
+
+def _curve_panels(
+    results: Mapping[str, Any], summary: Mapping[str, Any], metric: str
+) -> list[Panel]:
+    panels = []
+    for task, of_label in summary["curves"].items():
+        lines = []
+        for label, curves in of_label.items():
+            curve = curves.get(metric)
+            if curve and _any(curve["mean"]):
+                seeds = _seeds(results, task, label, metric)
+                lines.append(Line(label, curves["env_steps"], curve["mean"], curve["low"],
+                                  curve["high"], seeds))  # fmt: skip
+        panels.append(Panel(task, lines))
+    return panels
+
+
+def _seeds(
+    results: Mapping[str, Any], task: str, label: str, metric: str
+) -> list[tuple[int, Numbers, Numbers]]:
+    """The curves of the complete seeds."""
+    return [
+        (member["seed"], member["curve"]["env_steps"], member["curve"][metric])
+        for cell in results["cells"]
+        if (cell["task"], cell["label"]) == (task, label)
+        for member in cell["members"]
+        if member["status"] == "complete" and _any(member["curve"].get(metric, []))
+    ]
+
+
+def _profile_panels(summary: Mapping[str, Any]) -> list[Panel]:
+    return [
+        Panel(
+            task,
+            [
+                Line(label, p["returns"], p["share"], p["low"], p["high"], [])
+                for label, p in of_label.items()
+                if _any(p["share"])
+            ],
+        )
+        for task, of_label in summary["profiles"].items()
+    ]
+
+
+def _any(values: Iterable[float | None]) -> bool:
+    return any(value is not None for value in values)
+
+
+def write_figures(
+    results: Mapping[str, Any], summary: Mapping[str, Any], folder: Path, extra: Extra = NOTHING
+) -> dict[str, Path]:
+    """Writes `folder/figures/NAME.png` and `.svg`; the same bytes for the same input.
+
+    Returns:
+      The SVG file of each figure by its name.
+    """
+    plots = [*extra.plots, *plots_of(results, summary)]
+    return draw_plots(plots, {**looks_of(results), **extra.looks}, folder)
+
+
+def draw_plots(
+    plots: Sequence[Plot], looks: Mapping[str, style.Look], folder: Path
+) -> dict[str, Path]:
+    """Writes both files of each plot under `folder/figures`; the SVG files by name."""
+    written = {}
+    for plot in plots:
+        path = folder / "figures" / plot.name
+        with style.applied():
+            figure = _draw(plot, looks)
+            style.save(figure, path.with_suffix(".png"))
+            written[plot.name] = style.save(figure, path.with_suffix(".svg"))
+    return written
+
+
+def _draw(plot: Plot, looks: Mapping[str, style.Look]) -> Any:
+    from matplotlib.figure import Figure
+
+    drawn = {line.label for panel in plot.panels for line in panel.lines}
+    texts = {label: fill(label, WRAP) for label in looks if label in drawn}
+    rows = -(-len(plot.panels) // COLUMNS)
+    columns = -(-len(plot.panels) // rows)
+    width = 3.6 * columns if columns > 1 else 5.4
+    longest = max(len(line) for text in texts.values() for line in text.splitlines())
+    legend_columns = max(1, int(width * 11 / (longest + 9)))
+    legend_rows = -(-len(texts) // legend_columns)
+    size = (width, 2.6 * rows + 0.2 * legend_rows + 0.3)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    handles = {}
+    for axes, panel in zip(grid, plot.panels, strict=False):
+        for line in panel.lines:
+            x, y, low, high = (np.array(v, float) for v in (line.x, line.y, line.low, line.high))
+            handles[line.label] = style.draw_line(axes, looks[line.label], x, y, low, high)
+        _label_axes(axes, plot, panel)
+    for axes in grid[len(plot.panels) :]:
+        axes.set_visible(False)
+    figure.legend([handles[label] for label in texts], [*texts.values()], handlelength=3.2,
+                  loc="outside lower center", ncols=legend_columns)  # fmt: skip
+    return figure
+
+
+def _label_axes(axes: Any, plot: Plot, panel: Panel) -> None:
+    axes.set_title(fill(panel.task, WRAP))
+    axes.set_ylabel(plot.y_label)
+    axes.set_xlabel(plot.x_label)
+    if plot.x_label == "env steps":
+        style.count_steps(axes)
+    if plot.limits:
+        low, high = plot.limits
+        margin = 0.02 * (high - low)
+        shown = axes.get_ylim() if low < 0 else plot.limits
+        axes.set_ylim(max(low, shown[0]) - margin, min(high, shown[1]) + margin)

@@ -1,0 +1,314 @@
+"""`sauna compare` and `sauna study`: train what is missing, then say what was found."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sauna.config.presets import algorithm_of, chosen_preset
+from sauna.config.settings import Config
+from sauna.envs.probe import Probe
+from sauna.envs.spaces import Spaces
+from sauna.experiments.report.numbers import digits_of_tasks, interval, number
+from sauna.experiments.study.execute.display import StudyView
+from sauna.experiments.study.execute.executor import Executor
+from sauna.experiments.study.execute.local import LocalExecutor
+from sauna.experiments.study.measuring import gather_measured, items_of, measure
+from sauna.experiments.study.results import gather, typed
+from sauna.experiments.study.spec import Spec, check, load_spec, read_spec
+from sauna.experiments.study.summary import FILTERING, summarize
+from sauna.experiments.study.units import (
+    Unit,
+    digest_of,
+    most_seeds,
+    seeds_per_unit,
+    study_identity,
+    units_of,
+)
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, Interrupted
+from sauna.system.signals import handled
+from sauna.training.prepare import check_read_after_settling, look_at, placed, settle
+
+SEEDS = 6  # of a comparison, where none are given
+
+
+def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
+    """The study that `sauna compare ENV` runs: its folder is named after its settings.
+
+    Raises:
+      BadInput: unknown arms or settings that cannot be used.
+    """
+    rules = {}
+    if "sauna-reference" in arms:  # beside it the others take its rules, so that the filter differs
+        rules = {"truncation": "terminate", "budget": "env"}
+    algorithm = algorithm_of(chosen_preset(settings))
+    own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
+    entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
+    values = {"tasks": [env], "arms": entries, "seeds": SEEDS, **rules, **settings}
+    spec = read_spec({"name": "compare", **values})
+    place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
+    name = f"compare_{place}_{digest_of(study_identity(spec))}"
+    return spec._replace(name=name, text={**spec.text, "name": name})
+
+
+def compare_command(
+    env: str, arms: tuple[str, ...], settings: Mapping[str, Any], out: str | Path
+) -> str:
+    """What a user types to make the same comparison again."""
+    flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
+    return f"sauna compare {shlex.quote(env)} --arms {','.join(arms)}{flags}{_typed_out(out)}"
+
+
+def study_command(name: str, out: str | Path) -> str:
+    """What a user types to run the study again."""
+    return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
+
+
+def _typed_out(out: str | Path) -> str:
+    return f" {typed('out', out)}" if str(out) != "runs" else ""
+
+
+def study(
+    spec: Spec,
+    out: Path,
+    command: str,
+    jobs: int,
+    on: str = "local",
+    address: str = "",
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Trains what is missing of `spec` and writes results, summary, report and figures.
+
+    Everything is under `out`: `units/` holds the runs, `NAME/` what was found.
+
+    Args:
+      spec: the study.
+      out: the folder.
+      command: that ran it, for the report.
+      jobs: trainings at a time; 0: one per core.
+      on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
+      address: of the cluster.
+      quiet: show nothing.
+
+    Returns:
+      the summary.
+
+    Raises:
+      BadInput: an environment, the cluster or the folder cannot be used, another study works there,
+        or another of this name did.
+      Interrupted: a signal came; running again continues.
+    """
+    if jobs < 0:
+        raise BadInput("processes: must be a whole number of at least 0")
+    if on == "ray":
+        from sauna.experiments.study.execute import ray_cluster
+
+        ray_cluster.check(address)
+    elif address:
+        raise BadInput("address: read with --on ray only")
+    _check_runs(spec)
+    if on == "local":
+        jobs = jobs or (1 if _on_gpu(spec) else cores())
+        return _train(LocalExecutor, spec, out, command, jobs, command, quiet)
+    again = f"{command} --on {on}" + (f" --address {address}" if address else "")
+    with ray_cluster.connected(address, jobs) as jobs:
+        return _train(ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet)
+
+
+def _check_runs(spec: Spec) -> None:
+    """Checks every run of the study as it would be checked when it starts.
+
+    Raises:
+      BadInput: an environment or settings that cannot be used; the arm is named.
+    """
+    found: dict[tuple[str, ...], Probe] = {}
+    for arm in spec.arms:
+        for task in arm.tasks:
+            config = placed(check(arm, task))
+            if spec.measure and config.backend == "device":
+                raise BadInput(f"backend: measure needs environments on the host, not {task}")
+            key = task, config.env_kwargs, config.backend
+            if key not in found:
+                found[key] = look_at(config)
+            try:
+                settled = settle(config, found[key].spaces)
+                given = {**arm.given(task, arm.seeds), "drop_rate_from": settled.drop_rate_from}
+                check_read_after_settling(found[key].spaces, settled, given)
+                _check_measurable(spec, settled, found[key].spaces)
+            except BadInput as error:
+                raise BadInput(f"arm {arm.label!r}: {error}") from None
+
+
+def _check_measurable(spec: Spec, config: Config, spaces: Spaces) -> None:
+    """Refuses what only an environment's spaces tell of a measurement."""
+    if spec.measure == "dial" and not config.normalize_observations:
+        raise BadInput("measure: dial takes its scale from the normaliser of observations, which "
+                       f"{config.env} does not have")  # fmt: skip
+    if spec.measure == "noise" and spaces.observation_kind == "image":
+        raise BadInput("measure: noise keeps rollouts of observations in memory, which pictures "
+                       "are too large for")  # fmt: skip
+
+
+def _on_gpu(spec: Spec) -> bool:
+    """Whether some run takes a whole GPU, which others would only slow down."""
+    configs = (placed(check(arm, task)) for arm in spec.arms for task in arm.tasks)
+    return any(config.backend == "device" and config.device == "gpu" for config in configs)
+
+
+def _train(
+    executor: type[Executor],
+    spec: Spec,
+    out: Path,
+    command: str,
+    jobs: int,
+    again: str,
+    quiet: bool,
+) -> dict[str, Any]:
+    """The study on one kind of executor; `again` is the command that continues it there."""
+    place, folder = out / spec.name, out / "units"
+    size = _unit_size(spec, place, jobs)
+    with _held(folder):
+        _note(spec, place, size)
+        units = units_of(spec, size)
+        view = StudyView(spec, units, folder, quiet)
+        members = sum(len(unit.seeds) for unit in units)
+        view.say(f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
+                 f"writing to {place}")  # fmt: skip
+        noted: list[int] = []
+        with handled(partial(_note_signal, noted)):
+            view.open()
+            try:
+                executor(folder, jobs, view, lambda: bool(noted)).run(units)
+                view.close()
+                if spec.measure:
+                    measure(spec, units, folder, place, min(jobs, cores()), view.say,
+                            lambda: bool(noted))  # fmt: skip
+            finally:
+                view.close()
+    summary = write(spec, units, folder, place, command)
+    if noted:
+        name = signal.Signals(noted[0]).name
+        raise Interrupted(noted[0], f"stopped by {name}; continue with: {again}")
+    return summary
+
+
+def _note_signal(noted: list[int], number: int) -> None:
+    """The first signal lets the units save; the second one stops at once."""
+    if noted:
+        raise Interrupted(number, "stopped at once; running again continues")
+    noted.append(number)
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """The folder of units, made and held: one study at a time."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"out: cannot make {folder}: {error.strerror}") from error
+    with run_directory.lock(folder):
+        yield
+
+
+def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
+    """Seeds per unit: as when the study began, so that its units are found again.
+
+    Raises:
+      BadInput: the folder holds another study of this name.
+    """
+    path = place / "study.json"
+    if place.exists() and not place.is_dir():
+        raise BadInput(f"out: {place} is no folder")
+    if path.is_file():
+        stored = json.loads(path.read_text())
+        if not _is_same(stored["study"], spec):
+            raise BadInput(f"study: {place} holds another study of this name; give --out")
+        return int(stored["seeds_per_unit"])
+    return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
+
+
+def _note(spec: Spec, place: Path, size: int) -> None:
+    """Makes the study's folder and notes what the study is."""
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
+    run_directory.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+
+
+def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:
+    """Whether a study reads as `spec`, however its values are written."""
+    try:
+        return study_identity(read_spec(text)) == study_identity(spec)
+    except BadInput:
+        return False
+
+
+def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
+    """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
+    from sauna.experiments.measure import coverage_report, noise_report, posture_report
+    from sauna.experiments.report.figures import NOTHING
+    from sauna.experiments.study.report import write_report
+
+    results = gather(spec, units, folder, command)
+    summary = summarize(results)
+    extra = NOTHING
+    if spec.measure:
+        measured = gather_measured(spec, units, folder, place, results)
+        run_directory.write_json(place / f"{spec.measure}.json", measured)
+        study = {"noise": noise_report, "dial": coverage_report, "torso": posture_report}[
+            spec.measure
+        ]
+        summary["measured"] = study.verdicts(measured)
+        summary["not_measured"] = sum(
+            not item.is_done for item in items_of(spec, units, folder, place)
+        )
+        extra = (
+            posture_report.extra(measured, place)
+            if study is posture_report
+            else study.extra(measured)
+        )
+    run_directory.write_json(place / "results.json", results)
+    run_directory.write_json(place / "summary.json", summary)
+    write_report(results, summary, place, extra)
+    return summary
+
+
+def lines(summary: Mapping[str, Any]) -> list[str]:
+    """The table and the verdicts, as text."""
+    head = ["task", "arm", "seeds", "final return, IQM", "area, IQM", "mean +- std", "keep rate",
+            "env steps", "P(better)"]  # fmt: skip
+    digits = digits_of_tasks(summary["table"])
+    rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
+    said = [v["text"] for v in summary["verdicts"]]
+    if summary["filtering"]:
+        said += ["", "Is it the filter? " + FILTERING, *(v["text"] for v in summary["filtering"])]
+    said += summary.get("measured", [])
+    return [*(line.rstrip() for line in table), "", *said]
+
+
+def _row(row: Mapping[str, Any], digits: int) -> list[str]:
+    failed = f" ({row['failed']} failed)" if row["failed"] else ""
+    mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
+    return [
+        row["task"], row["label"], f"{row['seeds']}{failed}", interval(row["final_iqm"], digits),
+        interval(row["area_iqm"], digits), f"{mean} +- {std}", number(row["keep_rate"], 3),
+        number(row["env_steps"], 0), interval(row["improvement"], 2),
+    ]  # fmt: skip
+
+
+def cores() -> int:
+    return os.cpu_count() or 1
+
+
+__all__ = ["comparison", "cores", "lines", "load_spec", "study", "write"]

@@ -1,0 +1,1 @@
+"""Training a study's units: here or on a Ray cluster."""

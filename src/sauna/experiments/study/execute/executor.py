@@ -1,0 +1,148 @@
+"""Which units of a study run when, how often, and what becomes of those that fail."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from sauna.experiments.study.units import Unit, mark_split, needs_split, parts, split
+from sauna.system import run_directory
+
+ATTEMPTS = 2  # a failed unit is continued once
+NO_RATES = "the arm whose drop rates it repeats failed"
+
+
+class View(Protocol):
+    """Where the progress of units is shown."""
+
+    def started(self, unit: Unit) -> None: ...
+    def progress(self, unit: Unit, message: dict[str, Any]) -> None: ...
+    def stopped(self, unit: Unit) -> None: ...
+    def ended(self, unit: Unit, error: str | None) -> None: ...
+    def refresh(self) -> None: ...
+
+
+class Executor(ABC):
+    """Runs units, `jobs` at a time; a subclass says where.
+
+    A unit that fails is continued once. If it fails again it is split into its seeds, each of which
+    is trained once, as nobody can tell which of them broke it; a seed alone that fails for good is
+    noted in its `failed.json`.
+
+    Args:
+      folder: where the units' folders are.
+      jobs: units at a time.
+      view: is told of progress.
+      stopping: whether to end; running units then finish their iteration and save.
+    """
+
+    def __init__(self, folder: Path, jobs: int, view: View, stopping: Callable[[], bool]) -> None:
+        self._folder, self._jobs, self._view, self._stopping = folder, jobs, view, stopping
+        self._waiting: list[Unit] = []
+        self._running: dict[str, Unit] = {}
+        self._attempts: dict[str, int] = {}
+        self._hurry = False  # something went wrong, or a second signal came: wait for no unit
+
+    def run(self, units: list[Unit]) -> None:
+        """Runs every unit that is neither complete nor failed; returns when all are, or stopped."""
+        everything = [part for unit in units for part in parts(unit, self._folder)]
+        for unit in everything:
+            self._forgive(unit)
+        self._waiting = [unit for unit in everything if not self._is_over(unit)]
+        try:
+            while self._waiting or self._running:
+                if self._stopping():
+                    self._waiting.clear()
+                    self._tell_to_stop()
+                self._fill()
+                self._pump()
+                self._view.refresh()
+        except BaseException:
+            self._hurry = True
+            raise
+        finally:
+            self._close()
+
+    @abstractmethod
+    def _start(self, unit: Unit) -> None:
+        """Starts or continues the unit's run."""
+
+    @abstractmethod
+    def _pump(self) -> None:
+        """Handles what has arrived within a moment; `_end` is called for each unit that ended."""
+
+    @abstractmethod
+    def _tell_to_stop(self) -> None:
+        """Lets every running unit finish its iteration and save; may be called again."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Leaves nothing behind that is still running."""
+
+    def _is_over(self, unit: Unit) -> bool:
+        return unit.is_complete(self._folder) or unit.error(self._folder) is not None
+
+    def _fill(self) -> None:
+        """Starts units until every job has one, or none is ready."""
+        waiting = self._waiting
+        for unit in list(waiting):
+            if len(self._running) >= self._jobs:
+                return
+            if unit.name in self._running:  # another label's, of the same settings
+                continue
+            if self._is_over(unit):
+                waiting.remove(unit)
+            elif needs_split(unit, self._folder):
+                self._split(unit)
+            elif self._source_failed(unit):
+                waiting.remove(unit)
+                self._give_up(unit, NO_RATES)
+            elif unit.source is None or self._is_ready(unit.source):
+                waiting.remove(unit)
+                self._running[unit.name] = unit
+                self._view.started(unit)
+                self._start(unit)
+
+    def _is_ready(self, source: str) -> bool:
+        return run_directory.is_complete(self._folder / source / "run")
+
+    def _source_failed(self, unit: Unit) -> bool:
+        return unit.source is not None and (self._folder / unit.source / "failed.json").exists()
+
+    def _forgive(self, unit: Unit) -> None:
+        """Lets a coin try again whose source no longer counts as failed: somebody removed it."""
+        if unit.error(self._folder) == NO_RATES and not self._source_failed(unit):
+            (self._folder / unit.name / "failed.json").unlink()
+
+    def _end(self, name: str, error: str) -> None:
+        """A unit is no longer running; `error` says why, if it is not complete."""
+        unit = self._running.pop(name)
+        self._view.stopped(unit)
+        if unit.is_complete(self._folder):
+            self._view.ended(unit, None)
+        elif not self._stopping():
+            self._attempts[name] = self._attempts.get(name, 0) + 1
+            if self._attempts[name] < ATTEMPTS:
+                self._waiting.insert(0, unit)
+            elif len(unit.seeds) > 1:
+                self._split(unit)
+                self._attempts |= dict.fromkeys(
+                    (single.name for single in split(unit, self._folder)), ATTEMPTS - 1
+                )
+            else:
+                self._give_up(unit, error)
+
+    def _split(self, unit: Unit) -> None:
+        """Its seeds wait in its place; another label's unit of the same settings goes with it."""
+        waiting = self._waiting
+        mark_split(unit, self._folder)
+        place = waiting.index(unit) if unit in waiting else 0
+        waiting[place:place] = split(unit, self._folder)
+        waiting[:] = [other for other in waiting if other.name != unit.name]
+
+    def _give_up(self, unit: Unit, error: str) -> None:
+        (self._folder / unit.name).mkdir(parents=True, exist_ok=True)
+        run_directory.write_json(self._folder / unit.name / "failed.json", {"error": error})
+        self._view.ended(unit, error)

@@ -1,0 +1,56 @@
+"""Running the units of a study on this machine: one process per core, until none is left."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+from pathlib import Path
+
+from sauna.experiments.study.execute.executor import Executor, View
+from sauna.experiments.study.execute.process import Message, UnitProcess
+from sauna.experiments.study.units import Unit
+
+
+class LocalExecutor(Executor):
+    """Runs units in `jobs` processes at a time."""
+
+    def __init__(self, folder: Path, jobs: int, view: View, stopping: Callable[[], bool]) -> None:
+        super().__init__(folder, jobs, view, stopping)
+        self._messages: queue.SimpleQueue[tuple[str, Message | None]] = queue.SimpleQueue()
+        self._processes: dict[str, UnitProcess] = {}
+        self._errors: dict[str, str] = {}
+
+    def _start(self, unit: Unit) -> None:
+        place, name = self._folder / unit.name, unit.name
+        place.mkdir(parents=True, exist_ok=True)
+        self._processes[name] = UnitProcess(
+            unit.given(self._folder),
+            place / "stderr.txt",
+            lambda message: self._messages.put((name, message)),
+        )
+
+    def _pump(self) -> None:
+        try:
+            name, message = self._messages.get(timeout=0.2)
+            while True:
+                if message is None:
+                    how = self._processes.pop(name).end()
+                    self._end(name, self._errors.pop(name, how))
+                else:
+                    if "error" in message:
+                        self._errors[name] = message["error"]
+                    self._view.progress(self._running[name], message)
+                name, message = self._messages.get_nowait()
+        except queue.Empty:
+            return
+
+    def _tell_to_stop(self) -> None:
+        for process in self._processes.values():
+            process.stop()
+
+    def _close(self) -> None:
+        self._tell_to_stop()
+        for process in self._processes.values():
+            if self._hurry:
+                process.kill()
+            process.end()

@@ -1,0 +1,136 @@
+"""One unit of a study, as a process: trains or resumes a run and tells its progress.
+
+    python -m sauna.experiments.study.execute.unit_process < settings
+
+The first line of standard input holds the settings as JSON. Each line of standard output is a JSON
+object: rows of progress, or an error. The end of standard input means that the study is gone: the
+iteration is finished, the state saved, and the process ends.
+
+Where the run is made elsewhere than it is kept, `elsewhere` among the settings holds `recorded`,
+what its config has to name instead, and `folder`, which only we can remove if our parent is gone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+from sauna.config.presets import Member
+from sauna.config.settings import Config, to_json
+from sauna.system import run_directory
+from sauna.system.errors import Interrupted, SaunaError
+from sauna.training import run as runs
+from sauna.training.train import train_run
+
+PATIENCE = 300.0  # seconds that a run may still be held by a process that is ending
+SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate")
+
+
+class LineDisplay:
+    """A display whose reader is a program."""
+
+    def __init__(self, out: TextIO) -> None:
+        self._out = out
+
+    def say(self, text: str) -> None:
+        self.send({"said": text})
+
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        last = {row["member"]: row for row in rows}
+        self.send({"resumed": [_shown(row) for row in last.values()]})
+
+    def phase(self, process: int, text: str) -> None:
+        self.send({"phase": text})
+
+    def rows(self, rows: list[dict[str, Any]]) -> None:
+        self.send({"rows": [_shown(row) for row in rows]})
+
+    def refresh(self) -> None:
+        pass
+
+    def summary(self, members: dict[str, dict[str, Any]]) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def send(self, message: dict[str, Any]) -> None:
+        try:
+            self._out.write(json.dumps(message) + "\n")
+            self._out.flush()
+        except BrokenPipeError:
+            pass  # the study is gone; the end of standard input stops us
+
+
+def _shown(row: dict[str, Any]) -> dict[str, Any]:
+    return {key: row[key] for key in SHOWN if key in row}
+
+
+def train(given: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay) -> None:
+    """Starts the run, or continues it where it is."""
+    path, deadline = Path(given["out"]), time.monotonic() + PATIENCE
+    while True:
+        resume = (path / "config.json").exists()
+        try:
+            run = runs.reopen(path, {}, display) if resume else runs.start(given, display)
+            break
+        except (
+            run_directory.InUse
+        ):  # by a unit of a study that was killed: it is about to save and end
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+    if elsewhere and not resume:
+        _record(run, elsewhere["recorded"])
+    train_run(run, display, resume=resume)
+
+
+def _record(run: runs.Run, recorded: dict[str, Any]) -> None:
+    """Notes places and revision as on the study's machine, where the run is kept."""
+    stored = run_directory.read_config(run.path)
+    stored["git"] = recorded.pop("git")
+    run.config = dataclasses.replace(run.config, **recorded)
+    run.given = {**run.given, **recorded}
+    run_directory.write_json(
+        run.path / "config.json", {**stored, "config": to_json(run.config), "given": run.given}
+    )
+
+
+def main() -> int:
+    parent = os.getppid()
+    given = json.loads(sys.stdin.readline())
+    elsewhere = given.pop("elsewhere", {})
+    threading.Thread(target=_stop_with_the_study, daemon=True).start()
+    # What an environment or a library prints must not mix with our lines: it goes to the log.
+    display = LineDisplay(os.fdopen(os.dup(1), "w"))
+    os.dup2(2, 1)
+    try:
+        train(given, elsewhere, display)
+    except Interrupted as error:
+        return 128 + error.signal_number
+    except SaunaError as error:
+        display.send({"error": str(error)})
+        return 1
+    finally:
+        if elsewhere and os.getppid() != parent:
+            shutil.rmtree(elsewhere["folder"], ignore_errors=True)
+    return 0
+
+
+def _stop_with_the_study() -> None:
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

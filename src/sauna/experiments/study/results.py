@@ -1,0 +1,141 @@
+"""What a study has found so far, gathered from the runs of its units: `results.json`."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sauna.config.settings import flag, to_json
+from sauna.experiments.curves import area_under_curve
+from sauna.experiments.study.spec import Arm, Spec, check
+from sauna.experiments.study.units import Unit, parts
+from sauna.system import run_directory
+
+FORMAT = 1
+POINTS = 60  # of each member's curve that are kept
+METRIC = "mean training return (sampled actions) of the last 100 episodes"
+CURVES = ("return_mean", "keep_rate", "vex_mean", "vex_spread", "vex_median",
+          "explained_variance", "entropy")  # fmt: skip
+DIGITS = 6  # significant digits of a curve's points
+
+
+def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[str, Any]:
+    """Everything that is known, one entry per trained member; see `docs/studies.md`."""
+    cells = [
+        _cell(arm, task, [u for u in units if (u.label, u.task) == (arm.label, task)], folder)
+        for task in spec.tasks
+        for arm in spec.arms
+        if task in arm.tasks
+    ]
+    top = {key: value for key, value in spec.text.items() if key != "arms"}
+    return {
+        "format": FORMAT,
+        "name": spec.name,
+        "command": command,
+        "metric": METRIC,
+        "baseline": spec.baseline,
+        "settings": top,
+        **_made_with(units, folder),
+        "cells": cells,
+    }
+
+
+def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
+    """Versions and machines of the runs; each difference is listed."""
+    found: dict[str, list[Any]] = {"versions": [], "machine": [], "git": []}
+    for unit in units:
+        for part in parts(unit, folder):
+            path = part.run(folder) / "config.json"
+            stored = json.loads(path.read_text()) if path.is_file() else {}
+            for name, values in found.items():
+                if name in stored and stored[name] not in values:
+                    values.append(stored[name])
+    return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
+
+
+def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any]:
+    config = to_json(check(arm, task))
+    members = [m for unit in units for m in _members(unit, folder, config["steps"])]
+    flags = {**arm.settings, "arm": arm.arm, "seeds": arm.seeds}
+    text = " ".join(typed(key, value) for key, value in flags.items())
+    if arm.rates_of is not None:
+        config["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
+        text += f" --drop-rate-from RUN  # of {arm.rates_of!r}, the same seeds"
+    return {
+        "task": task,
+        "label": arm.label,
+        "arm": arm.arm,
+        "baseline": arm.baseline,
+        "rates_of": arm.rates_of,
+        "preset": config["preset"],
+        "config": config,
+        "command": f"sauna train {shlex.quote(task)} {text}",
+        "git": _made_with(units, folder)["git"],
+        "members": sorted(members, key=lambda member: arm.seeds.index(member["seed"])),
+    }
+
+
+def typed(name: str, value: Any) -> str:
+    """A setting as it is typed; one seed ends in a comma, without which it would be a count."""
+    if isinstance(value, bool):
+        return flag(name) if value else flag("no_" + name)
+    if isinstance(value, list | tuple):
+        value = ",".join(map(str, value)) + "," * (name == "seeds" and len(value) == 1)
+    text = json.dumps(value) if isinstance(value, dict) else str(value)
+    return f"{flag(name)} {shlex.quote(text)}"
+
+
+def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
+    found = []
+    for part in parts(unit, folder):
+        rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in part.seeds}
+        for row in run_directory.rows(part.run(folder)):
+            rows[row["seed"]].append(row)
+        for seed in part.seeds:
+            error = part.error(folder)
+            status = "running" if rows[seed] else "waiting"
+            if part.is_complete(folder):
+                status = "complete"
+            elif error is not None:
+                status = "failed"
+            found.append(
+                {"seed": seed, "status": status, "error": error, **_ended(rows[seed], budget)}
+            )
+    return found
+
+
+def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
+    """A member's last numbers and its thinned curve.
+
+    The area is that of the first `budget` env steps, also where kept steps are counted and a member
+    takes more env steps.
+    """
+    last = rows[-1] if rows else {}
+    steps = np.array([row["env_steps"] for row in rows], float)
+    returns = np.array([row.get("return_mean", np.nan) for row in rows], float)
+    within = steps <= budget
+    kept, tried = last.get("kept_steps"), last.get("env_steps")
+    return {
+        "final_return": last.get("return_mean"),
+        "area": area_under_curve(steps[within], returns[within]),
+        "env_steps": tried,
+        "kept_steps": kept,
+        "keep_rate": kept / tried if kept is not None and tried else None,
+        "episodes": last.get("episodes"),
+        "explained_variance": last.get("explained_variance"),
+        "curve": _curve(rows),
+    }
+
+
+def _curve(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    chosen = np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int)).tolist()
+    thinned = [rows[i] for i in chosen] if rows else []
+    curve: dict[str, list[Any]] = {"env_steps": [row["env_steps"] for row in thinned]}
+    moved = ("threshold",) if any("threshold" in row for row in thinned) else ()
+    for name in (*CURVES, *moved):
+        curve[name] = [float(f"{row[name]:.{DIGITS}g}") if name in row else None for row in thinned]
+    return curve

@@ -1,0 +1,286 @@
+"""What a study trains: tasks x arms x seeds, from a small declarative file.
+
+    name = "mine"
+    tasks = ["Hopper-v5", "HalfCheetah-v5"]
+    seeds = 6
+    steps = 1e6
+
+    [[arms]]
+    label = "ppo"
+
+    [[arms]]
+    label = "sauna 0.8"
+    arm = "sauna"
+    threshold = 0.8
+
+Any setting of a run may stand at the top, for all arms, or in an arm. `baseline` is the label that
+others are compared with. `measure` names what is measured of the trained members: `noise` or
+`dial` at checkpoints along their training, `torso` (of HalfCheetah) at its end. An arm may name its
+own `tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured drop rates of the arm
+`rates_of`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import string
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sauna.config.presets import ARMS, DECIDED, FIXED, SHARED_RULES, arm_config, parse_all, resolve
+from sauna.config.settings import FIELDS, Config, check_read, parse, to_json
+from sauna.system.errors import BadInput, nearest
+
+_OWN = (*DECIDED, "seeds")
+_NAME = set(string.ascii_letters + string.digits + "-_.+")
+_TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
+MEASURES = ("noise", "dial", "torso")
+_ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
+
+
+class Arm(NamedTuple):
+    """One line of a comparison: a method with its settings, on some tasks and seeds."""
+
+    label: str
+    arm: str
+    settings: dict[str, Any]  # as a user would give them, without env and seeds
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    baseline: str | None  # the label it is compared with
+    rates_of: str | None  # the label whose drop rates it repeats
+
+    def given(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
+        """The settings of a run of some seeds on one task."""
+        return {**self.settings, "env": task, "arm": self.arm, "seeds": list(seeds)}
+
+
+class Spec(NamedTuple):
+    """A whole study; `text` is what it was read from, as JSON values."""
+
+    name: str
+    baseline: str
+    arms: list[Arm]
+    text: dict[str, Any]
+    measure: str | None = None  # what is measured of the members once they are trained
+
+    @property
+    def tasks(self) -> list[str]:
+        return list(dict.fromkeys(task for arm in self.arms for task in arm.tasks))
+
+
+def read_spec(values: Mapping[str, Any]) -> Spec:
+    """The study that `values` describe.
+
+    Raises:
+      BadInput: an unknown key, a label twice or unknown, or settings that cannot be used.
+    """
+    for key in values:
+        if key not in _TOP and (key not in FIELDS or key in (*_OWN, "arm")):
+            known = [*_TOP, *(name for name in FIELDS if name not in (*_OWN, "arm"))]
+            raise BadInput(f"study: unknown key {key!r}{nearest(key, known)}")
+    common = {key: value for key, value in values.items() if key not in _TOP}
+    parse_all(common)
+    name = _text(values.get("name", "study"), "name")
+    if name in ("units", "") or not set(name) <= _NAME or not name.strip("."):
+        raise BadInput(f"study: name {name!r} cannot be a folder of its own under --out")
+    entries = values.get("arms") or []
+    if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
+        raise BadInput("study: arms must be a list of tables")
+    if not entries:
+        raise BadInput("study: no arms")
+    for key in ("tasks", "seeds"):
+        if key in values and all(key in entry for entry in entries):
+            raise BadInput(f"study: {key} is read by none of the arms, which have their own")
+    arms = [_read_arm(dict(entry), values, common) for entry in entries]
+    _check_common(common, arms)
+    labels = [arm.label for arm in arms]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise BadInput(f"study: the label {label!r} is given twice")
+    baseline = _text(values.get("baseline", labels[0]), "baseline")
+    arms = [_settle(arm, arms, baseline) for arm in arms]
+    spec = Spec(name, baseline, arms, _plain(values), values.get("measure"))
+    configs = [check(arm, task) for arm in arms for task in arm.tasks]
+    if spec.measure is not None:
+        _check_measure(spec.measure, configs)
+    if spec.measure == "dial":  # whose scale is the baseline's
+        scaled = next(arm.tasks for arm in arms if arm.label == baseline)
+        if missing := set(spec.tasks) - set(scaled):
+            raise BadInput(f"study: dial needs {baseline!r} on {', '.join(sorted(missing))}, too")
+    return spec
+
+
+def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, Any]) -> Arm:
+    for key in entry:
+        if key not in _ARM and (key not in FIELDS or key in _OWN):
+            known = [*_ARM, *(name for name in FIELDS if name not in _OWN)]
+            raise BadInput(f"study: unknown key {key!r} in an arm{nearest(key, known)}")
+    arm = _text(entry.get("arm", entry.get("label")), "arm")
+    if arm not in ARMS:
+        raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)})"
+                       f"{nearest(arm, ARMS)}")  # fmt: skip
+    tasks = entry.get("tasks", top.get("tasks"))
+    if not isinstance(tasks, list) or not tasks or len(set(map(str, tasks))) < len(tasks):
+        raise BadInput("study: tasks must be a list of environments, each of them once")
+    seeds = parse("seeds", entry.get("seeds", top.get("seeds", 6)))
+    own = {key: value for key, value in entry.items() if key not in _ARM}
+    optional = {key: _text(entry[key], key) for key in ("baseline", "rates_of") if key in entry}
+    return Arm(
+        _text(entry.get("label", arm), "label"), arm,
+        {**{key: value for key, value in common.items() if reads(arm, {**common, **own}, key)},
+         **own},
+        tuple(_text(task, "tasks") for task in tasks), seeds,
+        optional.get("baseline"), optional.get("rates_of"),
+    )  # fmt: skip
+
+
+def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
+    """Whether a run of `arm` with these settings takes the setting `key` at all."""
+    config = dataclasses.replace(arm_config(arm, parse_all(settings)), arm=(arm,))
+    try:
+        check_read([config], {key: None})
+    except BadInput:
+        return False
+    return key not in FIXED.get(arm, ())
+
+
+def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
+    """Refuses a setting for all arms that none of them takes."""
+    for key in common:
+        if not any(key in arm.settings for arm in arms):
+            raise BadInput(f"study: {key} is read by none of the arms "
+                           f"{', '.join(arm.label for arm in arms)}")  # fmt: skip
+
+
+def _check_measure(measure: Any, configs: list[Config]) -> None:
+    """Refuses a measurement that is not known or would lack what it needs."""
+    if measure not in MEASURES:
+        raise BadInput(f"study: measure must be one of {', '.join(MEASURES)}, not {measure!r}"
+                       f"{nearest(str(measure), MEASURES)}")  # fmt: skip
+    for config in configs:
+        rollout = config.rollout_steps * config.envs
+        kept = config.keep_checkpoints * config.checkpoint_every * rollout
+        if measure != "torso" and kept < config.steps:
+            every = min(config.checkpoint_every, -(-config.steps // (100 * rollout)))
+            raise BadInput("keep_checkpoints: measure needs the checkpoints along training; set "
+                           f"checkpoint_every = {every} and keep_checkpoints = "
+                           f"{-(-config.steps // (every * rollout))}")  # fmt: skip
+        if config.backend == "device":
+            raise BadInput("backend: measure needs environments on the host")
+        coin = config.filter == "random-drop" and config.drop_rate_from
+        if measure == "dial" and config.filter != "sauna" and not coin:
+            raise BadInput('study: measure = "dial" is of arms that have a threshold, and of coins '
+                           f"that repeat their rates, not of {', '.join(config.arm)}")  # fmt: skip
+        if measure == "torso" and not config.env.startswith("HalfCheetah"):
+            raise BadInput(f'study: measure = "torso" is of HalfCheetah, not of {config.env}')
+        if measure == "dial" and not config.normalize_observations:
+            raise BadInput("normalize_observations: dial takes its scale from the normaliser")
+    if measure == "noise" and all(map(drops_nothing, configs)):
+        raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
+
+
+def drops_nothing(config: Config) -> bool:
+    """Whether there is nothing dropped to measure, or no advantage of what is dropped."""
+    return config.filter == "none" or config.gae_over == "kept"
+
+
+def _text(value: Any, key: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise BadInput(f"study: {key} must be a name, not {value!r}")
+    return value
+
+
+def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
+    """Fills in what an arm left open: its baseline, and whose drop rates it repeats."""
+    known = {other.label: other for other in arms}
+    source = arm.rates_of
+    if arm.arm == "random-drop" and source is None and "drop_rate" not in arm.settings:
+        filtered = [a.label for a in arms if ARMS[a.arm]["filter"] == "sauna"]
+        if not filtered:
+            raise BadInput("study: random-drop needs a filtered arm whose rates it repeats")
+        source = filtered[0]
+    if source is not None and arm.arm != "random-drop":
+        raise BadInput(f"study: rates_of is read by random-drop only, not by {arm.label!r}")
+    own = arm.baseline or (None if arm.label == baseline else baseline)
+    for name in (own, source, baseline):
+        if name is not None and name not in known:
+            raise BadInput(f"study: there is no arm {name!r}{nearest(name, known)}")
+    if own == arm.label:
+        raise BadInput(f"study: {own!r} cannot be its own baseline")
+    if own is not None and (missing := set(arm.tasks) - set(known[own].tasks)):
+        raise BadInput(f"study: {own!r}, the baseline of {arm.label!r}, is not trained on "
+                       f"{', '.join(sorted(missing))}")  # fmt: skip
+    if source is not None:
+        if ARMS[known[source].arm]["filter"] != "sauna":
+            raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")
+        if set(arm.tasks) - set(known[source].tasks) or arm.seeds != known[source].seeds:
+            raise BadInput(f"study: {source!r} must have the tasks and the seeds of {arm.label!r}")
+        arm = arm._replace(settings={**_rules_of(known[source], arm), **arm.settings})
+    return arm._replace(baseline=own, rates_of=source)
+
+
+def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
+    """The rules of a filtered arm that a coin which repeats its drop rates has to share."""
+    theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, coin))
+    rules = {name: theirs[name] for name in SHARED_RULES if name not in FIXED[coin.arm]}
+    return {
+        name: theirs[name]
+        for name in rules
+        if theirs[name] != own[name] and reads(coin.arm, {**coin.settings, **rules}, name)
+    }
+
+
+def check(arm: Arm, task: str) -> Config:
+    """The config of a run of `arm`; a random-drop arm's source is settled later.
+
+    Raises:
+      BadInput: the settings cannot be used; the label is named.
+    """
+    given = arm.given(task, arm.seeds)
+    if arm.rates_of is not None:
+        given["drop_rate_from"] = "the source"
+    try:
+        return resolve(given)
+    except BadInput as error:
+        raise BadInput(f"study, arm {arm.label!r}: {error}") from None
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        return dict(json.loads(json.dumps(values)))
+    except TypeError as error:
+        raise BadInput(f"study: {error}") from None
+
+
+def load_spec(name: str) -> Spec:
+    """A study of this package by name, or one in a TOML file.
+
+    Raises:
+      BadInput: there is no such study or file, or it cannot be read.
+    """
+    known = built_in()
+    if name in known:
+        return read_spec(tomllib.loads(known[name]))
+    path = Path(name)
+    if not path.is_file():
+        listed = ", ".join(known)
+        raise BadInput(f"study: no study or file {name!r} (known: {listed}){nearest(name, known)}")
+    try:
+        values = tomllib.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BadInput(f"study: cannot read {path}: {error}") from error
+    return read_spec({"name": path.stem, **values})
+
+
+def built_in() -> dict[str, str]:
+    """The studies of this package: `{name: text}`."""
+    folder = resources.files("sauna.experiments.study") / "studies"
+    return {
+        entry.name.removesuffix(".toml"): entry.read_text()
+        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name)
+        if entry.name.endswith(".toml")
+    }

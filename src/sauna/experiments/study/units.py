@@ -1,0 +1,155 @@
+"""A study's work in units: each is an ordinary run of a few seeds of one arm on one task.
+
+A unit's folder is named after its settings (those that differ from a run's defaults, however they
+were written), so that studies which share settings share the work, and a study that is run again
+finds what is done.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sauna.config.settings import Config, to_json
+from sauna.experiments.study.spec import Arm, Spec, check
+from sauna.system import run_directory
+
+SEEDS = 3  # per unit: members of one process share the cost of each vector step
+RULES = 1  # to be raised when a default changes, so that runs of before are not taken for new ones
+
+
+class Unit(NamedTuple):
+    """A run to be made.
+
+    Attributes:
+      name: of its folder.
+      settings: what the run is given, without the place and the source of drop rates.
+      source: the unit whose measured drop rates it repeats.
+    """
+
+    name: str
+    task: str
+    label: str
+    seeds: tuple[int, ...]
+    settings: dict[str, Any]
+    source: str | None
+
+    def run(self, folder: Path) -> Path:
+        """The run directory."""
+        return folder / self.name / "run"
+
+    def given(self, folder: Path) -> dict[str, Any]:
+        """Everything that the run is given."""
+        given = {**self.settings, "out": str(self.run(folder)), "processes": 1}
+        if self.source is not None:
+            given["drop_rate_from"] = str(folder / self.source / "run")
+        return given
+
+    def error(self, folder: Path) -> str | None:
+        """Why it failed for good, or None."""
+        path = folder / self.name / "failed.json"
+        return str(json.loads(path.read_text())["error"]) if path.is_file() else None
+
+    def is_complete(self, folder: Path) -> bool:
+        return run_directory.is_complete(self.run(folder))
+
+
+def seeds_per_unit(spec: Spec, cores: int) -> int:
+    """As many as share a process well, or fewer where cores would stay idle at the start, when arms
+    that repeat others' drop rates have to wait; as even as can be without another unit."""
+    first = [arm for arm in spec.arms if arm.rates_of is None]
+
+    def units(size: int) -> int:
+        return sum(-(-len(arm.seeds) // size) * len(arm.tasks) for arm in first)
+
+    most = next((size for size in range(SEEDS, 1, -1) if units(size) >= cores), 1)
+    return next(size for size in range(1, SEEDS + 1) if units(size) == units(most))
+
+
+def most_seeds(spec: Spec) -> int:
+    """All seeds of an arm: a GPU trains them in little more time than one."""
+    return max(len(arm.seeds) for arm in spec.arms)
+
+
+def units_of(spec: Spec, size: int) -> list[Unit]:
+    """All units of `size` seeds at most, arm by arm, a source before those that repeat it."""
+    arms = {arm.label: arm for arm in spec.arms}
+    ordered = sorted(spec.arms, key=lambda arm: arm.rates_of is not None)
+    return [
+        _unit(arms, arm, task, seeds)
+        for arm in ordered
+        for task in arm.tasks
+        for seeds in _parts(arm, size)
+    ]
+
+
+def _parts(arm: Arm, size: int) -> Iterator[tuple[int, ...]]:
+    for first in range(0, len(arm.seeds), size):
+        yield arm.seeds[first : first + size]
+
+
+def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
+    source = _unit(arms, arms[arm.rates_of], task, seeds).name if arm.rates_of else None
+    settings = arm.given(task, seeds)
+    digest = digest_of([RULES, identity(arm, task, seeds), source])
+    place = "".join(c if c.isalnum() or c in "-." else "-" for c in task)
+    name = f"{place}_{arm.arm}_{seeds[0]}-{seeds[-1]}_{digest}"
+    return Unit(name, task, arm.label, seeds, settings, source)
+
+
+def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
+    """What of a run's config differs from the defaults: the same for the same training."""
+    config, usual = to_json(check(arm._replace(seeds=seeds), task)), to_json(Config())
+    return {name: value for name, value in config.items() if value != usual[name]}
+
+
+def study_identity(spec: Spec) -> list[Any]:
+    """Everything that a study trains and compares: the same for the same study."""
+    return [
+        [arm.label, arm.baseline, arm.rates_of, identity(arm, task, arm.seeds)]
+        for arm in spec.arms
+        for task in arm.tasks
+    ] + [spec.measure]
+
+
+def digest_of(values: Any) -> str:
+    """A name for JSON values."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def split(unit: Unit, folder: Path) -> list[Unit]:
+    """A unit of several seeds as units of one: so that the others go on where one failed."""
+    source_is_split = unit.source is not None and _is_split(folder / unit.source)
+    return [
+        unit._replace(
+            name=f"{unit.name}/seed-{seed}",
+            seeds=(seed,),
+            settings={**unit.settings, "seeds": [seed]},
+            source=f"{unit.source}/seed-{seed}" if source_is_split else unit.source,
+        )
+        for seed in unit.seeds
+    ]
+
+
+def mark_split(unit: Unit, folder: Path) -> None:
+    """Notes that the unit's seeds are trained one by one from now on."""
+    (folder / unit.name).mkdir(parents=True, exist_ok=True)
+    run_directory.write_json(folder / unit.name / "split.json", {"seeds": list(unit.seeds)})
+
+
+def _is_split(place: Path) -> bool:
+    return (place / "split.json").exists()
+
+
+def parts(unit: Unit, folder: Path) -> list[Unit]:
+    """The units that hold the runs: the unit itself, or one per seed where it was split."""
+    is_split = _is_split(folder / unit.name) and not unit.is_complete(folder)
+    return split(unit, folder) if is_split else [unit]
+
+
+def needs_split(unit: Unit, folder: Path) -> bool:
+    """Whether its source was split, so that it has to follow."""
+    return len(unit.seeds) > 1 and unit.source is not None and _is_split(folder / unit.source)

@@ -1,1 +1,0 @@
-"""Metrics: `metrics.jsonl` is the truth, everything else shows it."""

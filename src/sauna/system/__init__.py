@@ -1,0 +1,1 @@
+"""Files, processes and signals: what a run needs of the operating system."""

@@ -1,0 +1,121 @@
+"""Reading files that somebody else may have written, or that a disk may have damaged.
+
+Nothing is read but a regular file in its place: no link is followed, no FIFO is waited for. How
+much is read is known before it is read. JSON and tensor headers are checked before anything is
+made of them; neither can name code.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from pathlib import Path
+from typing import Any, NoReturn
+
+from sauna.system.errors import SaunaError
+
+JSON_BYTES = 2**22  # a manifest has a few thousand
+HEADER_BYTES = 2**26
+# Bytes per item of what checkpoints hold.
+ITEM_BYTES = {"BOOL": 1, "U8": 1, "I8": 1, "I16": 2, "U16": 2, "F16": 2, "BF16": 2, "I32": 4,
+              "U32": 4, "F32": 4, "I64": 8, "U64": 8, "F64": 8}  # fmt: skip
+
+
+class Untrusted(SaunaError):
+    """A file is not what it has to be; the message says what is wrong with it."""
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """The bytes of a regular file of at most `limit` bytes.
+
+    Raises:
+      Untrusted: there is no such file, it is a link or something else, or it is larger.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise Untrusted(f"{path.name} is not a regular file")
+        if status.st_size > limit:
+            raise Untrusted(f"{path.name} has {status.st_size} bytes; at most {limit} are expected")
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            return file.read(limit + 1)
+    except OSError as error:
+        raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
+    finally:
+        os.close(descriptor)
+
+
+def parse_object(data: bytes) -> dict[str, Any]:
+    """A JSON object in which no key is given twice and every number is finite.
+
+    Raises:
+      Untrusted: it is something else.
+    """
+    try:
+        value = json.loads(data, object_pairs_hook=_each_key_once, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise Untrusted(f"is not JSON that is expected here: {error}") from error
+    if not isinstance(value, dict):
+        raise Untrusted("does not hold a JSON object")
+    return value
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a key is given twice")
+    return found
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not a number")
+
+
+def check_tensors(blob: bytes) -> None:
+    """That a safetensors blob's header describes exactly the bytes behind it.
+
+    Raises:
+      Untrusted: offsets overlap, leave gaps or lie outside, or do not fit shape and type.
+    """
+    size = int.from_bytes(blob[:8], "little")
+    if len(blob) < 8 or size > min(HEADER_BYTES, len(blob) - 8):
+        raise Untrusted("its header does not fit into it")
+    header = parse_object(blob[8 : 8 + size])
+    header.pop("__metadata__", None)
+    end = 0
+    for name, tensor in sorted(header.items(), key=_start_of):
+        first, last = tensor["data_offsets"]
+        if first != end or last - first != _bytes_of(name, tensor):
+            raise Untrusted(f"the bytes of {name!r} are not where and what its header says")
+        end = last
+    if end != len(blob) - 8 - size:
+        raise Untrusted("there are bytes that belong to no tensor")
+
+
+def _start_of(item: tuple[str, Any]) -> int:
+    name, tensor = item
+    if not isinstance(tensor, dict) or set(tensor) != {"dtype", "shape", "data_offsets"}:
+        raise Untrusted(f"the header of {name!r} is not a tensor's")
+    offsets = tensor["data_offsets"]
+    if not (isinstance(offsets, list) and len(offsets) == 2 and all(map(_is_size, offsets))):
+        raise Untrusted(f"the offsets of {name!r} are not two sizes")
+    return int(offsets[0])
+
+
+def _bytes_of(name: str, tensor: dict[str, Any]) -> int:
+    shape, dtype = tensor["shape"], tensor["dtype"]
+    if not isinstance(shape, list) or len(shape) > 32 or not all(map(_is_size, shape)):
+        raise Untrusted(f"the shape of {name!r} is not a list of sizes")
+    if not isinstance(dtype, str) or dtype not in ITEM_BYTES:
+        raise Untrusted(f"the type of {name!r} is not one of a checkpoint")
+    return math.prod(shape) * ITEM_BYTES[dtype]
+
+
+def _is_size(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63

@@ -1,0 +1,1 @@
+"""A run: prepared, trained by worker processes, written to disk."""

@@ -1,0 +1,299 @@
+"""The workers of a run: granting iterations, and writing what they send in a fixed order.
+
+Workers run freely, but at most `LEAD` iterations ahead of the slowest, so that all can be stopped
+at the same iteration. Rows go to `metrics.jsonl` iteration by iteration and member by member, and
+a checkpoint is saved once every member has sent its state: the files do not depend on how members
+are shared over processes.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Mapping
+from functools import partial
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sauna.config.settings import Config, local_parts, to_json
+from sauna.system import checkpoint, run_directory, watchdog
+from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
+from sauna.system.signals import handled
+from sauna.system.watchdog import Watch
+from sauna.training.display import Display
+from sauna.training.tensorboard import TensorBoard
+from sauna.training.worker import serve, write_job
+
+if TYPE_CHECKING:
+    from sauna.training.run import Run
+
+LEAD = 2  # iterations that a process may be ahead of the slowest one
+SECONDS_AHEAD = 2.0  # on the device, where a call runs several: what a signal may have to wait
+MOST_AHEAD = 64
+
+
+class Coordinator:
+    """The workers of one run and what they have sent but is not yet written."""
+
+    def __init__(
+        self,
+        run: Run,
+        display: Display,
+        loaded: checkpoint.Checkpoint | None,
+        inexact: bool,
+    ) -> None:
+        self._run, self._display = run, display
+        self._iteration = loaded.manifest["iteration"] if loaded else 0
+        self._parts = np.array_split(np.arange(len(run.members)), run.config.processes)
+        self._rows: dict[int, dict[int, Message]] = {}
+        self._states: list[dict[int, dict[str, np.ndarray]]] = [{} for _ in self._parts]
+        self._reached = [self._iteration] * len(self._parts)
+        self._ended: list[int | None] = [None] * len(self._parts)
+        self._due: list[tuple[int, dict[str, int]]] = []  # checkpoints waiting for their states
+        self._lead, self._granted = LEAD, 0
+        self._signal: int | None = None
+        self._stopping = False
+        self._tensorboard = TensorBoard(run.path, run.config)
+        replay = not inexact and run.differs is None
+        if loaded and not replay:
+            display.say("warning: not an exact resume: every environment starts a new episode")
+        self._workers = [self._start(part, loaded, replay) for part in self._parts]
+        self._watch = Watch(self._workers)
+
+    def _start(
+        self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
+    ) -> Worker:
+        run = self._run
+        if local_parts(run.config):
+            worker = start_thread(partial(serve, dies_alone=False))
+        else:
+            worker = start_worker("sauna.training.worker", _environment(run.config))
+        names = [run.members[index].name for index in part]
+        arrays = {
+            key: value
+            for key, value in (loaded.arrays if loaded else {}).items()
+            if any(key.startswith(name + "/") for name in names)
+        }
+        header = write_job(
+            to_json(run.config),
+            run.given,
+            run.spaces,
+            [int(index) for index in part],
+            [run.drop_rates[index] for index in part] if run.drop_rates else [],
+            self._iteration,
+            replay,
+        )
+        try:
+            worker.say(header, arrays)
+        except BrokenPipeError:
+            pass  # its end is noticed, and named, when its inbox is read
+        return worker
+
+    def __enter__(self) -> Coordinator:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._watch.close()
+        for worker in self._workers:
+            worker.stop(0.0 if error[0] else 5.0)
+        self._tensorboard.close()
+        self._display.close()
+
+    def run(self) -> None:
+        run = self._run
+        self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
+        with handled(self._on_signal):
+            self._grant()
+            while any(end is None for end in self._ended):
+                self._pump()
+            complete = self._signal is None
+            self._save(self._last_iteration(), run_directory.log_sizes(self._run.path))
+            self._write_summary(complete)
+        if not complete:
+            raise Interrupted(
+                self._signal or 0,
+                f"stopped by {signal.Signals(self._signal or 0).name} after iteration "
+                f"{self._last_iteration()}; continue with: sauna resume {self._run.path}",
+            )
+
+    def _last_iteration(self) -> int:
+        return max(end for end in self._ended if end is not None)
+
+    def _on_signal(self, number: int) -> None:
+        """Only notes the first signal: it may come in the middle of anything."""
+        if self._signal is not None:
+            raise Interrupted(
+                number, f"stopped at once; continue with: sauna resume {self._run.path}"
+            )
+        self._signal = number
+
+    def _stop(self, number: int) -> None:
+        """Lets every worker end at the iteration that is granted, which is the same for all."""
+        self._stopping = True
+        name = signal.Signals(number).name
+        self._display.say(f"{name}: finishing the iteration, then saving (again to stop at once)")
+        self._tell()
+
+    def _grant(self) -> None:
+        """Lets every worker run at most `self._lead` iterations ahead of the slowest."""
+        running = [r for r, end in zip(self._reached, self._ended, strict=True) if end is None]
+        if running and not self._stopping and min(running) + self._lead > self._granted:
+            self._granted = min(running) + self._lead
+            self._tell()
+
+    def _tell(self) -> None:
+        for worker, end in zip(self._workers, self._ended, strict=True):
+            if end is None:
+                try:
+                    worker.say({"granted": self._granted, "stop": self._stopping})
+                except BrokenPipeError:
+                    pass  # its end is noticed, and named, when its inbox is read
+
+    def _pump(self) -> None:
+        """Handles whatever has arrived within a moment, and shows it."""
+        if self._signal is not None and not self._stopping:
+            self._stop(self._signal)
+        inboxes = {
+            worker.inbox: number
+            for number, worker in enumerate(self._workers)
+            if self._ended[number] is None
+        }
+        with self._watch.listening():
+            ready = wait(list(inboxes), timeout=0.1)
+        for inbox in ready:
+            number = inboxes[inbox]  # type: ignore[index]
+            self._handle(number, self._receive(number))
+        self._display.refresh()
+
+    def _receive(self, number: int) -> Message:
+        worker = self._workers[number]
+        try:
+            with self._watch.listening():
+                message = receive(worker.inbox)
+        except (EOFError, ConnectionResetError):
+            code = worker.process.wait()
+            how = f"ended with exit code {code}"
+            if number in self._watch.hung:
+                how = f"gave no sign of life for {watchdog.SILENCE:g} s and was killed"
+            raise SaunaError(
+                f"training process {number} ({worker.process.pid}) {how}; the last good "
+                f"checkpoint is kept, continue with: sauna resume {self._run.path}"
+            ) from None
+        self._watch.heard(number)
+        return message
+
+    def _handle(self, number: int, message: Message) -> None:
+        header = message.header
+        match header["kind"]:
+            case "phase":
+                self._display.phase(number, header["text"])
+            case "iteration":
+                self._rows.setdefault(header["iteration"], {})[number] = message
+                self._reached[number] = header["iteration"] + 1
+                if self._run.config.backend == "device":
+                    self._lead = lead_for(header["timing"]["seconds"])
+                self._display.rows(header["rows"])
+                self._grant()
+                self._flush()
+            case "state":
+                self._states[number][header["iteration"]] = message.arrays
+                self._flush()
+            case "failure":
+                error = BadInput if header.get("bad_input") else SaunaError
+                raise error(header["message"])
+            case "done":
+                self._ended[number] = self._reached[number]
+                self._grant()
+                self._flush()
+
+    def _flush(self) -> None:
+        """Writes the iterations that are complete, in order, and the checkpoints among them."""
+        while self._complete(self._iteration, self._rows.get(self._iteration, {})):
+            messages = self._rows.pop(self._iteration)
+            rows = [row for number in sorted(messages) for row in messages[number].header["rows"]]
+            self._write_rows(rows, [m.header["timing"] for m in messages.values()])
+            self._iteration += 1
+            if self._iteration % self._run.config.checkpoint_every == 0:
+                self._due.append((self._iteration, run_directory.log_sizes(self._run.path)))
+        while self._due and self._all_states_of(self._due[0][0]):
+            self._save(*self._due.pop(0))
+
+    def _complete(self, iteration: int, messages: Mapping[int, Message]) -> bool:
+        """Whether every process that runs this iteration has reported it."""
+        return bool(messages) and all(
+            number in messages or (end is not None and end <= iteration)
+            for number, end in enumerate(self._ended)
+        )
+
+    def _all_states_of(self, iteration: int) -> bool:
+        return all(
+            iteration in states or end is not None
+            for states, end in zip(self._states, self._ended, strict=True)
+        )
+
+    def _save(self, iteration: int, logs: dict[str, int]) -> None:
+        """A checkpoint of all members at (the start of) an iteration, or at their end before it."""
+        arrays: dict[str, np.ndarray] = {}
+        for states in self._states:
+            arrays |= states[iteration if iteration in states else max(states)]
+            for old in [key for key in states if key < iteration and key != max(states)]:
+                del states[old]
+        checkpoint.save_checkpoint(
+            self._run.path / "checkpoints",
+            iteration,
+            arrays,
+            {**self._run.manifest(), "logs": logs},
+            self._run.config.keep_checkpoints,
+        )
+
+    def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, float]]) -> None:
+        seconds = max(timing["seconds"] for timing in timings)
+        steps = sum(timing["env_steps"] for timing in timings)
+        timing = {
+            "iteration": self._iteration,
+            "env_steps": steps,
+            "seconds": seconds,
+            "steps_per_second": steps / seconds,
+        }
+        if all("collect_seconds" in timing for timing in timings):  # unknown on the device
+            timing["collect_seconds"] = max(timing["collect_seconds"] for timing in timings)
+        _append(self._run.path / "metrics.jsonl", rows)
+        _append(self._run.path / "timing.jsonl", [timing])
+        self._tensorboard.write(rows, timing)
+
+    def _write_summary(self, complete: bool) -> None:
+        last: dict[str, dict[str, Any]] = {}
+        for row in run_directory.rows(self._run.path):
+            last[row["member"]] = row
+        kept = ("arm", "seed", "env_steps", "kept_steps", "episodes", "return_mean",
+                "return_mean_reported", "explained_variance")  # fmt: skip
+        summary = {
+            name: {key: row[key] for key in kept if key in row} for name, row in last.items()
+        }
+        text = "return_mean: mean training return (sampled actions) of the last 100 episodes"
+        run_directory.write_json(
+            self._run.path / "summary.json",
+            {"complete": complete, "metric": text, "members": summary},
+        )
+        self._display.summary(summary)
+
+
+def lead_for(seconds: float) -> int:
+    """Iterations to grant where one takes `seconds`: a call to the device runs many short ones."""
+    return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MOST_AHEAD))
+
+
+def _environment(config: Config) -> dict[str, str]:
+    """What a worker's JAX has to know before it is imported."""
+    if config.backend == "device" and config.device == "gpu":
+        return {"JAX_PLATFORMS": "cuda"}
+    return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+
+
+def _append(path: Path, rows: list[dict[str, Any]]) -> None:
+    with path.open("a") as file:
+        file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)

@@ -1,0 +1,208 @@
+"""What a person sees while a run trains: a live table on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+from sauna.config.presets import Member
+from sauna.config.settings import Config
+
+PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
+
+
+class Display(Protocol):
+    """Where a run shows itself. `say` works before `open` and after `close`."""
+
+    def say(self, text: str) -> None: ...
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        """`rows`: those of before, of a run that is resumed."""
+
+    def phase(self, process: int, text: str) -> None: ...
+    def rows(self, rows: list[dict[str, Any]]) -> None: ...
+    def refresh(self) -> None: ...
+    def summary(self, members: dict[str, dict[str, Any]]) -> None: ...
+    def close(self) -> None: ...
+
+
+def make_display() -> Display:
+    return LiveDisplay() if sys.stdout.isatty() else PlainDisplay()
+
+
+class _Progress:
+    """Latest row of each member, and the rate since training began."""
+
+    def __init__(self, config: Config, members: list[Member], rows: list[dict[str, Any]]) -> None:
+        self.config = config
+        self.latest: dict[str, dict[str, Any] | None] = {m.name: None for m in members}
+        self.phases: dict[int, str] = {}
+        self.seconds_left: float | None = None
+        self.rate: float | None = None
+        self._first: tuple[float, int] | None = None
+        for row in rows:
+            self.latest[row["member"]] = row
+
+    def rows(self, rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            self.latest[row["member"]] = row
+        done, now = sum(map(self.budget_used, self.latest)), time.monotonic()
+        if self._first is None:
+            if all(self.latest.values()):
+                self._first = (now, done)  # compiling is not counted into the rate
+        elif now > self._first[0]:
+            self.rate = (done - self._first[1]) / (now - self._first[0])
+            left = self.config.steps * len(self.latest) - done
+            self.seconds_left = left / self.rate if self.rate else None
+
+    def budget_used(self, name: str) -> int:
+        row = self.latest[name]
+        return row[f"{self.config.budget}_steps"] if row else 0
+
+    def status(self) -> str:
+        """One line: phase or rate, time left."""
+        share = sum(self.budget_used(n) for n in self.latest) / (
+            self.config.steps * len(self.latest)
+        )
+        if self.rate is None:
+            waiting = sorted(set(self.phases.values())) or ["starting"]
+            return ", ".join(waiting) + ("" if share == 0 else f", {share:.0%}")
+        left = "" if self.seconds_left is None else f", {duration(self.seconds_left)} left"
+        return f"{share:.0%}, {self.rate:,.0f} {self.config.budget} steps/s{left}"
+
+
+def duration(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def number(row: dict[str, Any] | None, key: str, form: str) -> str:
+    return format(row[key], form) if row and key in row else "-"
+
+
+class PlainDisplay:
+    """Lines of text, one every few seconds."""
+
+    def __init__(self) -> None:
+        self._progress: _Progress | None = None
+        self._shown = time.monotonic()
+        self._phases: set[str] = set()
+
+    def say(self, text: str) -> None:
+        print(text, flush=True)
+
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        self._progress = _Progress(config, members, rows)
+        self.say(headline(config, members, path))
+
+    def phase(self, process: int, text: str) -> None:
+        if text not in self._phases:
+            self._phases.add(text)
+            self.say(text)
+
+    def rows(self, rows: list[dict[str, Any]]) -> None:
+        assert self._progress is not None
+        self._progress.rows(rows)
+
+    def refresh(self) -> None:
+        progress = self._progress
+        if progress is None or time.monotonic() - self._shown < PLAIN_SECONDS:
+            return
+        self._shown = time.monotonic()
+        returns = ", ".join(
+            f"{name} {number(row, 'return_mean', '.1f')}" for name, row in progress.latest.items()
+        )
+        self.say(f"{progress.status()}; return: {returns}")
+
+    def summary(self, members: dict[str, dict[str, Any]]) -> None:
+        for name, row in members.items():
+            self.say(
+                f"{name}: return {number(row, 'return_mean', '.2f')} "
+                f"(training, last 100 episodes), {row['env_steps']:,} env steps, "
+                f"{row['kept_steps']:,} kept"
+            )
+
+    def close(self) -> None:
+        pass
+
+
+class LiveDisplay:
+    """A table that is redrawn in place."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+
+        self._console = Console()
+        self._live: Any = None
+        self._progress: _Progress | None = None
+
+    def say(self, text: str) -> None:
+        self._console.print(text, highlight=False, markup=False)
+
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        from rich.live import Live
+
+        self._progress = _Progress(config, members, rows)
+        self.say(headline(config, members, path))
+        self._live = Live(console=self._console, auto_refresh=False, transient=False)
+        self._live.start()
+        self.refresh()
+
+    def phase(self, process: int, text: str) -> None:
+        assert self._progress is not None
+        self._progress.phases[process] = text
+
+    def rows(self, rows: list[dict[str, Any]]) -> None:
+        assert self._progress is not None
+        self._progress.rows(rows)
+
+    def refresh(self) -> None:
+        if self._live is not None:
+            self._live.update(self._table(), refresh=True)
+
+    def _table(self) -> Any:
+        from rich.table import Table
+
+        assert self._progress is not None
+        table = Table(title=self._progress.status(), title_justify="left", box=None)
+        table.add_column("member")
+        for column in ("env steps", "episodes", "return", "keep rate", "Vex mean", "Vex spread"):
+            table.add_column(column, justify="right")
+        for name, row in self._progress.latest.items():
+            table.add_row(
+                name,
+                number(row, "env_steps", ",d"),
+                number(row, "episodes", ",d"),
+                number(row, "return_mean", ".1f"),
+                number(row, "keep_rate", ".3f"),
+                number(row, "vex_mean", ".3f"),
+                number(row, "vex_spread", ".3f"),
+            )
+        return table
+
+    def summary(self, members: dict[str, dict[str, Any]]) -> None:
+        self.refresh()
+        self.close()
+        self.say("return: mean training return of the last 100 episodes")
+
+    def close(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+
+def headline(config: Config, members: list[Member], path: Path) -> str:
+    return (
+        f"{config.env}: {len(members)} member{'s' if len(members) > 1 else ''} "
+        f"({', '.join(config.arm)} x {len(config.seeds)} seeds), {config.steps:,} "
+        f"{'env' if config.budget == 'env' else 'kept'} steps each, preset {config.preset}, "
+        f"{config.processes} process{'es' if config.processes > 1 else ''}; writing to {path}"
+    )

@@ -1,0 +1,1 @@
+"""The training loop of one process: collect -> advantages -> update -> log -> save."""

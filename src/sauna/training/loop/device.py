@@ -1,0 +1,283 @@
+"""Training the members of one process on the device, several iterations per call.
+
+The loop of `training.py` for environments that are pure functions. What it reports, and when it
+may go on, is the same; a call runs as many iterations as are granted and ends where a checkpoint
+is due.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sauna.algorithm.policy.normalize import Moments
+from sauna.algorithm.policy.policy import Policy
+from sauna.algorithm.rollout.collected import Collected, Episode
+from sauna.algorithm.types import Hypers, TrainState, member_keys
+from sauna.config.presets import Member
+from sauna.config.settings import Config, to_json
+from sauna.envs.device.contract import flat
+from sauna.envs.device.make import make_jax_env
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
+from sauna.system.errors import BadInput
+from sauna.system.run_directory import versions
+from sauna.training.loop.budget import goes_on
+from sauna.training.loop.device_program import (
+    MOST_PER_CALL,
+    MemberState,
+    Population,
+    Report,
+    is_sound,
+    make_mesh,
+)
+from sauna.training.loop.job import Job, Reporter, Setting, check_finite
+from sauna.training.loop.member_state import (
+    Counters,
+    fitting,
+    flat_params,
+    named_optimizer,
+    named_params,
+    under,
+    unpack_optimizer,
+)
+from sauna.training.loop.metrics import metrics_row
+from sauna.training.loop.multihost import check_shared, join, leave, read_place, same, share, tell
+
+Arrays = dict[str, np.ndarray]
+# What machines that train together may have each in their own way.
+OF_A_MACHINE = ("distributed", "out", "processes", "keep_checkpoints", "tensorboard",
+                "drop_rate_from")  # fmt: skip
+
+
+def train_on_device(job: Job, reporter: Reporter) -> None:
+    """Runs every iteration of the job's members, reporting each.
+
+    Raises:
+      NonFinite: an update gave a non-finite loss or parameter.
+      EnvironmentFailure: an environment gave a number that is not finite.
+    """
+    reporter.phase("making environments")
+    config = job.config
+    place = read_place(config.distributed)
+    join(place)
+    if not same(place, _settings(job)):
+        leave()
+        raise BadInput("distributed: the machines have different settings or versions; give each "
+                       "the same command but for its index")  # fmt: skip
+    population = make_population(job)
+    if config.device == "gpu":
+        reporter.phase(f"on {population.devices} of {len(jax.devices())} GPUs")
+    counters = [Counters() for _ in job.members]
+    restored = share(place, dict(job.restored or {}))
+    if restored:
+        counters = _restore(job, population, restored)
+    reporter.phase("compiling")
+    reporter.phase(f"compiled in {population.compile():.1f} s")
+    iteration = tell(place, job.start)
+    while any(goes_on(config, c) for c in counters):
+        due = config.checkpoint_every - iteration % config.checkpoint_every
+        number = tell(place, min(reporter.allowance(iteration), due, MOST_PER_CALL))
+        if not number:
+            break
+        clock = time.perf_counter()
+        reports = population.run(iteration, number)
+        seconds = time.perf_counter() - clock
+        iteration = _tell(job, reporter, iteration, reports, counters, seconds)
+        if iteration % config.checkpoint_every == 0:
+            reporter.state(iteration, pack(job, population, counters))
+    reporter.state(iteration, pack(job, population, counters))
+
+
+def _settings(job: Job) -> str:
+    """What must be alike on machines that train together."""
+    own = dict.fromkeys(OF_A_MACHINE, "")
+    members = [{**to_json(member.config), **own} for member in job.members]
+    return json.dumps([{**to_json(job.config), **own}, members, job.drop_rates, versions()])
+
+
+def make_population(job: Job) -> Population:
+    """The job's members at the start of their training."""
+    config = job.config
+    env = flat(make_jax_env(config.env, job.env_kwargs))
+    longest = max((len(rates) for rates in job.drop_rates), default=1)
+    settings = [
+        _setting(
+            member, job.drop_rates[p] if job.drop_rates else [member.config.drop_rate], longest
+        )
+        for p, member in enumerate(job.members)
+    ]
+    devices = _devices(config)
+    mesh = make_mesh(len(settings), config.envs, devices)
+    if config.distributed:
+        check_shared("distributed", len(settings), config.envs, len(devices))
+    return Population(config, job.spaces, env, settings, mesh)
+
+
+def _devices(config: Config) -> list[Any]:
+    """Those that share the population: of all machines.
+
+    Raises:
+      BadInput: there are fewer than asked for, or of another kind.
+    """
+    found, wanted = jax.devices(), config.devices
+    if found[0].platform != config.device:
+        raise BadInput(f"device: JAX uses the {found[0].platform} here, not the {config.device}")
+    if wanted > len(found):
+        raise BadInput(f"devices: {wanted} asked for, {len(found)} are there")
+    return found[:wanted] if wanted else found
+
+
+def _setting(member: Member, drop_rates: list[float], length: int) -> Setting:
+    values = {name: np.float32(getattr(member.config, name)) for name in Hypers._fields}
+    rates = drop_rates + [drop_rates[-1]] * (length - len(drop_rates))
+    hypers = Hypers(**values)  # type: ignore[arg-type]
+    steps = jnp.int32(member.config.steps)
+    return Setting(member_keys(member.seed), hypers, jnp.asarray(rates, jnp.float32), steps)
+
+
+def _tell(
+    job: Job,
+    reporter: Reporter,
+    first: int,
+    reports: list[Report],
+    counters: list[Counters],
+    seconds: float,
+) -> int:
+    """Reports what one call ran; the iteration that comes next."""
+    ran = np.stack([report.ran for report in reports])  # [P, MOST_PER_CALL]
+    number = int(ran.any(0).sum())
+    for i in range(number):
+        rows, steps = [], 0
+        for p in np.flatnonzero(ran[:, i]):
+            report = jax.tree.map(lambda x: x[i], reports[p])  # noqa: B023
+            member = job.members[p]
+            _check_sound(member, first + i, report)
+            collected = _collected(report)
+            counters[p].add(collected)
+            steps += collected.env_steps
+            rows.append(_row(member, job.config, first + i, collected, counters[p], report))
+        timing = {"env_steps": steps, "seconds": seconds / number}
+        reporter.iteration(first + i, rows, timing)
+    return first + number
+
+
+def _check_sound(member: Member, iteration: int, report: Report) -> None:
+    if is_sound(report):
+        return
+    if report.faults.found:
+        what = "reward" if report.faults.in_reward else "observation"
+        raise EnvironmentFailure(
+            f"environment {report.faults.env} of {member.name}, iteration {iteration}, step "
+            f"{report.faults.row} of the rollout: {what} is not finite"
+        )
+    check_finite(member, iteration, report.learned)
+
+
+def _collected(report: Report) -> Collected:
+    ends = report.ends
+    episodes = [
+        Episode(
+            int(ends.env[i]),
+            float(ends.return_[i]),
+            int(ends.length[i]),
+            bool(ends.truncated[i]),
+            bool(ends.kept[i]),
+        )
+        for i in np.flatnonzero(ends.there)
+    ]
+    return Collected(
+        None, int(report.env_steps), int(report.kept_steps), int(ends.number), episodes
+    )
+
+
+def _row(
+    member: Member,
+    config: Config,
+    iteration: int,
+    collected: Collected,
+    counters: Counters,
+    report: Report,
+) -> dict[str, Any]:
+    values = {name: getattr(member.config, name) for name in Hypers._fields}
+    hypers = Hypers(**{**values, "learning_rate": report.learning_rate})
+    return metrics_row(member, config, iteration, collected, counters, report.learned, hypers)
+
+
+def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
+    """The whole state of all members, as named arrays."""
+    arrays: Arrays = {}
+    for member, state, own in zip(job.members, population.states(), counters, strict=True):
+        packed = _pack_member(population.policy, state, own)
+        arrays |= {f"{member.name}/{name}": array for name, array in packed.items()}
+    return arrays
+
+
+def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arrays:
+    learner = state.learner
+    arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
+    arrays |= named_optimizer(learner)
+    arrays |= counters.to_arrays()
+    moments = state.collect.observation_moments
+    if isinstance(moments, Moments):  # where a trained policy looks for them, and as the host's
+        for name, array in moments._asdict().items():
+            arrays[f"observation_moments/{name}"] = np.asarray(array, np.float64)
+    arrays |= {f"collect/{name}": a for name, a in named_leaves(state.collect).items()}
+    return {name: np.array(array) for name, array in arrays.items()}
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """The arrays of a pytree by their place in it; keys as the integers they are made of."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): (
+            jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        )
+        for path, leaf in leaves
+    }
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """A tree like `example` with the arrays of `named_leaves`.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    leaves, structure = jax.tree_util.tree_flatten(example)
+    found = []
+    for leaf, (name, place) in zip(leaves, named_leaves(example).items(), strict=True):
+        array = jnp.asarray(fitting(arrays, name, place))
+        if _is_key(leaf):
+            array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))
+        found.append(array)
+    return jax.tree_util.tree_unflatten(structure, found)
+
+
+def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray]) -> list[Counters]:
+    """Puts all members back; what they had counted."""
+    states, counters = [], []
+    for member, example in zip(job.members, population.states(), strict=True):
+        own = under(member.name + "/", arrays)
+        counted = Counters.from_arrays(own)
+        optimizer = unpack_optimizer(own, example.learner)
+        params = flat_params(population.policy, example.learner.params, under("params/", own))
+        states.append(
+            MemberState(
+                TrainState(params, optimizer),
+                filled(example.collect, under("collect/", own)),
+                jnp.int32(counted.env_steps),
+                jnp.int32(counted.kept_steps),
+            )
+        )
+        counters.append(counted)
+    population.restore(states)
+    return counters

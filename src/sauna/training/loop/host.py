@@ -1,0 +1,136 @@
+"""Training the members of one process: collect -> advantages -> update -> log -> save.
+
+This is the loop itself. Who starts it, what is shown of it and where its messages are written is
+`run.py`'s business: the loop reads a clock for its timing rows, and otherwise only talks to a
+`Reporter`.
+"""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import numpy as np
+
+from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.learner.update import minibatch_order
+from sauna.algorithm.rollout.collected import Collected
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.rollout.program import Program, make_program
+from sauna.algorithm.types import Hypers, Keys, TrainState, member_keys
+from sauna.config.presets import Member
+from sauna.envs.host.contract import HostEnvs
+from sauna.envs.make import in_process_envs
+from sauna.envs.workers import ProcessEnvs
+from sauna.training.loop.budget import goes_on, hypers_of, step_limit
+from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
+from sauna.training.loop.member_state import Counters, pack_member, unpack_member
+from sauna.training.loop.metrics import metrics_row
+
+
+def train_on_host(job: Job, reporter: Reporter) -> None:
+    """Runs every iteration of the job's members, reporting each.
+
+    Raises:
+      NonFinite: an update gave a non-finite loss or parameter; nothing of it was reported.
+      EnvironmentFailure: from the environments.
+    """
+    config, members = job.config, job.members
+    reporter.phase("making environments")
+    program = make_program(config, job.spaces)
+    keys = [member_keys(member.seed) for member in members]
+    envs = make_envs(job)
+    try:
+        collector = HostCollector(program, job.spaces, envs, keys)
+        states, counters = _start(job, program, keys, collector, envs)
+        reporter.phase("compiling")
+        iteration = job.start
+        while any(goes_on(config, c) for c in counters) and reporter.allowance(iteration):
+            clock = time.perf_counter()
+            hypers = [hypers_of(job, p, counters[p], iteration) for p in range(len(members))]
+            limit = np.array([step_limit(config, c) for c in counters])
+            params = np.stack([np.asarray(state.params) for state in states])
+            collected = collector.collect(params, hypers, iteration, limit)
+            collect_seconds = time.perf_counter() - clock
+            rows = []
+            for p in np.flatnonzero(limit):
+                order = minibatch_order(config, members[p].seed, iteration)
+                states[p], learned = _learn(program, states[p], collected[p], hypers[p], order)
+                check_finite(members[p], iteration, learned)
+                counters[p].add(collected[p])
+                rows.append(
+                    metrics_row(
+                        members[p], config, iteration, collected[p], counters[p], learned,
+                        hypers[p],
+                    )
+                )  # fmt: skip
+            timing = {
+                "env_steps": sum(collected[p].env_steps for p in np.flatnonzero(limit)),
+                "seconds": time.perf_counter() - clock,
+                "collect_seconds": collect_seconds,
+            }
+            reporter.iteration(iteration, rows, timing)
+            iteration += 1
+            if iteration % config.checkpoint_every == 0:
+                reporter.state(
+                    iteration, _pack(program, members, states, counters, collector, envs)
+                )
+        reporter.state(iteration, _pack(program, members, states, counters, collector, envs))
+    finally:
+        envs.close()
+
+
+def make_envs(job: Job) -> HostEnvs:
+    """The `P * N` environments of the job, in this process or in workers."""
+    config = job.config
+    seeds = [(member.seed, n) for member in job.members for n in range(config.envs)]
+    if config.env_processes:
+        processes = min(config.env_processes, len(seeds))
+        return ProcessEnvs(
+            config.env, job.env_kwargs, seeds, processes, config.env_timeout, config.backend
+        )
+    return in_process_envs(config.env, job.env_kwargs, seeds, config.backend)
+
+
+def _start(
+    job: Job, program: Program, keys: list[Keys], collector: HostCollector, envs: HostEnvs
+) -> tuple[list[TrainState], list[Counters]]:
+    states = [program.init(k.init) for k in keys]
+    counters = [Counters() for _ in keys]
+    collector.start()
+    if job.restored is not None:
+        for p, member in enumerate(job.members):
+            states[p], counters[p] = unpack_member(
+                member.name, p, job.restored, states[p], program.policy, collector, envs, job.replay
+            )
+    return states, counters
+
+
+def _learn(
+    program: Program,
+    state: TrainState,
+    collected: Collected,
+    hypers: Hypers,
+    order: np.ndarray,
+) -> tuple[TrainState, UpdateMetrics]:
+    assert collected.rollout is not None
+    batch = program.make_batch(collected.rollout, hypers)
+    state, metrics = program.learn(state, collected.rollout, batch, hypers, order)
+    return state, jax.device_get(metrics)
+
+
+def _pack(
+    program: Program,
+    members: list[Member],
+    states: list[TrainState],
+    counters: list[Counters],
+    collector: HostCollector,
+    envs: HostEnvs,
+) -> Arrays:
+    """The whole state of all members, as named arrays."""
+    arrays: Arrays = {}
+    for p, member in enumerate(members):
+        arrays |= pack_member(
+            member.name, p, states[p], counters[p], program.policy, collector, envs
+        )
+    return arrays

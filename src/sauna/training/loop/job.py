@@ -1,0 +1,66 @@
+"""What one process trains, and who hears of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.types import Array, Hypers, Keys
+from sauna.config.presets import Member
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+from sauna.system.errors import SaunaError
+
+Arrays = dict[str, np.ndarray]
+
+
+class NonFinite(SaunaError):
+    """A loss or a parameter is not finite any more."""
+
+
+class Reporter(Protocol):
+    """Where the loop's messages go, and where its permissions come from."""
+
+    def phase(self, text: str) -> None: ...
+
+    def allowance(self, iteration: int) -> int:
+        """Waits until iteration `iteration` may start; how many may from there on. 0: stop."""
+
+    def iteration(
+        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
+    ) -> None: ...
+
+    def state(self, iteration: int, arrays: Arrays) -> None: ...
+
+
+class Job(NamedTuple):
+    """What one process trains."""
+
+    config: Config
+    spaces: Spaces
+    env_kwargs: dict[str, Any]
+    members: list[Member]
+    drop_rates: list[list[float]]  # per member and iteration; empty: the config's constant rate
+    restored: Mapping[str, np.ndarray] | None  # a checkpoint's arrays, or None to start afresh
+    start: int  # the first iteration to run
+    replay: bool  # whether environments can be brought back by replaying
+
+
+def check_finite(member: Member, iteration: int, metrics: UpdateMetrics) -> None:
+    """Raises:
+    NonFinite: naming the member and the iteration.
+    """
+    if not metrics.finite:
+        raise NonFinite(f"{member.name}: the update of iteration {iteration} is not finite")
+
+
+class Setting(NamedTuple):
+    """What a member is given and does not change."""
+
+    keys: Keys
+    hypers: Hypers  # with the learning rate before its schedule
+    drop_rates: Array  # [I] of each iteration; the last counts for all later ones
+    steps: Array  # [] int32, the budget

@@ -1,0 +1,218 @@
+"""The whole state of a member as named arrays, and back.
+
+Everything that a resumed run needs is here or follows from the seed and the iteration: JAX keys
+are folded from them, environments are replayed from their episode's seed and actions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+
+from sauna.algorithm.policy.normalize import Moments
+from sauna.algorithm.policy.policy import Policy
+from sauna.algorithm.rollout.collected import Collected
+from sauna.algorithm.rollout.host import HostCollector
+from sauna.algorithm.types import TrainState
+from sauna.envs.host.contract import HostEnvs
+from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.errors import SaunaError
+
+WINDOW = 100  # episodes that the reported mean return covers, as in baselines and the paper
+
+
+class NotRestored(SaunaError):
+    """An environment did not come back to where the checkpoint says it was."""
+
+
+@dataclass
+class Counters:
+    """What a member has done so far."""
+
+    env_steps: int = 0
+    kept_steps: int = 0
+    episodes: int = 0
+    recent_returns: list[float] = field(default_factory=list)  # of the last `WINDOW` episodes
+    reported_returns: list[float] = field(default_factory=list)  # those that ended on a kept step
+
+    def add(self, collected: Collected) -> None:
+        self.env_steps += collected.env_steps
+        self.kept_steps += collected.kept_steps
+        self.episodes += collected.ended
+        returns = [episode.return_ for episode in collected.episodes]
+        reported = [episode.return_ for episode in collected.episodes if episode.kept]
+        self.recent_returns = (self.recent_returns + returns)[-WINDOW:]
+        self.reported_returns = (self.reported_returns + reported)[-WINDOW:]
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Named as in a checkpoint."""
+        return {
+            f"counters/{key}": np.asarray(
+                value, np.float64 if isinstance(value, list) else np.int64
+            )
+            for key, value in dataclasses.asdict(self).items()
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Counters:
+        """The inverse of `to_arrays`."""
+        names = [part.name for part in dataclasses.fields(cls)]
+        return cls(**{name: arrays[f"counters/{name}"].tolist() for name in names})
+
+
+def named_params(policy: Policy, params: jax.Array) -> dict[str, np.ndarray]:
+    """The flat parameters as arrays named by their place in the network."""
+    leaves = jax.tree_util.tree_leaves_with_path(policy.unravel(params))
+    return {
+        "/".join(str(key.key) for key in path if key.key != "params"): np.asarray(leaf)
+        for path, leaf in leaves
+    }
+
+
+def flat_params(policy: Policy, example: jax.Array, named: Mapping[str, np.ndarray]) -> jax.Array:
+    """The inverse of `named_params`; `example` is any parameter vector of the policy."""
+    tree = policy.unravel(example)
+    structure = jax.tree_util.tree_structure(tree)
+    leaves = [
+        jnp.asarray(fitting(named, name, leaf))
+        for name, leaf in named_params(policy, example).items()
+    ]
+    return ravel_pytree(jax.tree_util.tree_unflatten(structure, leaves))[0]
+
+
+def fitting(stored: Mapping[str, np.ndarray], name: str, place: Any) -> np.ndarray:
+    """A stored array, if it is there and fits where it belongs.
+
+    Raises:
+      BadCheckpoint: it is missing, or of another shape or type.
+    """
+    array = stored.get(name)
+    if array is None or (array.shape, array.dtype) != (place.shape, place.dtype):
+        found = "missing" if array is None else f"{array.dtype}{list(array.shape)}"
+        expected = f"{place.dtype}{list(place.shape)}"
+        raise BadCheckpoint(f"checkpoint: {name} is {found}; this network and run need {expected}")
+    return array
+
+
+def pack_member(
+    name: str,
+    p: int,
+    state: TrainState,
+    counters: Counters,
+    policy: Policy,
+    collector: HostCollector,
+    envs: HostEnvs,
+) -> dict[str, np.ndarray]:
+    """Member `p`'s state, every name starting with the member's."""
+    arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
+    arrays |= named_optimizer(state)
+    arrays |= counters.to_arrays()
+    for key, value in (moments_of(collector, p) | collected_of(collector, p)).items():
+        arrays[key] = value
+    number = collector.state.episode_length.shape[1]
+    for n in range(number):
+        for key, value in envs.snapshot(p * number + n).items():
+            arrays[f"envs/{n}/{key}"] = value
+    return {f"{name}/{key}": np.array(value) for key, value in arrays.items()}
+
+
+def named_optimizer(state: TrainState) -> dict[str, np.ndarray]:
+    """The optimizer's state as arrays, in its own order."""
+    optimizer = state.optimizer
+    if isinstance(optimizer, optax.ScaleByRmsState):
+        named = {"rmsprop/mean_square": optimizer.nu}
+    else:
+        named = {"adam/count": optimizer.count, "adam/mean": optimizer.mu,
+                 "adam/variance": optimizer.nu}  # fmt: skip
+    return {name: np.asarray(array) for name, array in named.items()}
+
+
+def unpack_optimizer(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
+    """The inverse of `named_optimizer`.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    return type(example.optimizer)(
+        *(
+            jnp.asarray(fitting(own, name, place))
+            for name, place in named_optimizer(example).items()
+        )
+    )
+
+
+def unpack_member(
+    name: str,
+    p: int,
+    arrays: Mapping[str, np.ndarray],
+    example: TrainState,
+    policy: Policy,
+    collector: HostCollector,
+    envs: HostEnvs,
+    replay: bool,
+) -> tuple[TrainState, Counters]:
+    """Puts member `p` of the collector and its environments back; its learning state.
+
+    Without `replay` each environment starts the episode after the one it was in.
+
+    Raises:
+      NotRestored: a replayed environment shows another observation than the stored one.
+    """
+    own = under(name + "/", arrays)
+    params = flat_params(policy, example.params, under("params/", own))
+    state = TrainState(params, unpack_optimizer(own, example))
+    counters = Counters.from_arrays(own)
+    for key, place in moments_of(collector, p).items():
+        place[...] = fitting(own, key, place)
+    if replay:
+        for key, place in collected_of(collector, p).items():
+            place[...] = fitting(own, key, place)
+    collect = collector.state
+    number = len(collect.observation[p])
+    for n in range(number):
+        snapshot = under(f"envs/{n}/", own)
+        if replay:
+            seen = envs.restore(p * number + n, snapshot)
+            _check_replayed(name, n, collect.observation[p, n], seen)
+        else:
+            collect.observation[p, n] = envs.start_after(p * number + n, snapshot)
+    return state, counters
+
+
+def moments_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
+    """Views of member `p`'s running moments, by their names in a checkpoint."""
+    parts = {"reward_moments": Moments(*(part[p] for part in collector.reward_moments))}
+    if collector.observation_moments is not None:
+        parts["observation_moments"] = collector.observation_moments.of(p)
+    return {
+        f"{kind}/{name}": value
+        for kind, moments in parts.items()
+        for name, value in moments._asdict().items()
+    }
+
+
+def collected_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
+    """Views of what member `p` carries from one rollout to the next, by their names."""
+    return {f"collect/{key}": value[p] for key, value in collector.state._asdict().items()}
+
+
+def under(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays whose names start with `prefix`, without it."""
+    return {key[len(prefix) :]: a for key, a in arrays.items() if key.startswith(prefix)}
+
+
+def _check_replayed(name: str, n: int, stored: np.ndarray, seen: np.ndarray) -> None:
+    if not np.array_equal(seen, stored):
+        raise NotRestored(
+            f"{name}: environment {n} is not deterministic: replaying its episode ended at "
+            f"another observation than the checkpoint's; resume with --inexact to start new "
+            f"episodes instead"
+        )

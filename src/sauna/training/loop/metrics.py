@@ -1,0 +1,58 @@
+"""One row of `metrics.jsonl`: a member's iteration in numbers."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sauna.config.presets import Member
+from sauna.config.settings import Config
+
+if TYPE_CHECKING:
+    from sauna.algorithm.learner.metrics import UpdateMetrics
+    from sauna.algorithm.rollout.collected import Collected
+    from sauna.algorithm.types import Hypers
+    from sauna.training.loop.member_state import Counters
+
+
+def metrics_row(
+    member: Member,
+    config: Config,
+    iteration: int,
+    collected: Collected,
+    counters: Counters,
+    learned: UpdateMetrics,
+    hypers: Hypers,
+) -> dict[str, Any]:
+    """A row; what cannot be computed (a mean of no episode, a NaN) is left out.
+
+    `env_steps`, `kept_steps` and `episodes` count from the start of training; `keep_rate` is this
+    iteration's.
+    """
+    row: dict[str, Any] = {
+        "member": member.name,
+        "arm": member.arm,
+        "seed": member.seed,
+        "iteration": iteration,
+        "env_steps": counters.env_steps,
+        "kept_steps": counters.kept_steps,
+        "keep_rate": collected.kept_steps / collected.env_steps,
+        "episodes": counters.episodes,
+        "episode_returns": [episode.return_ for episode in collected.episodes],
+        "episode_lengths": [episode.length for episode in collected.episodes],
+        "episode_truncated": [episode.truncated for episode in collected.episodes],
+    }
+    if counters.recent_returns:
+        row["return_mean"] = float(np.mean(counters.recent_returns))
+    if config.gae_over == "kept" and counters.reported_returns:
+        # The released code logs only episodes whose last step was kept.
+        row["return_mean_reported"] = float(np.mean(counters.reported_returns))
+    for name, value in learned._asdict().items():
+        if name != "finite" and math.isfinite(value):
+            row[name] = float(value)
+    if "vex_target" in row and not float(hypers.vex_coef):
+        del row["vex_loss"], row["vex_target"]  # nothing learns them in this arm
+    row["learning_rate"] = float(hypers.learning_rate)
+    return row

@@ -1,0 +1,91 @@
+"""Training a run to its end: afresh, or from its newest good checkpoint."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sauna.config.presets import RESUMABLE
+from sauna.config.settings import Config, to_json
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput
+from sauna.training.coordinator import Coordinator
+from sauna.training.display import Display
+from sauna.training.run import Run, disk_errors
+
+
+def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> None:
+    """Trains a run to its end; returns when everything is written.
+
+    Raises:
+      BadInput: a setting cannot be used after all, as a worker found; a new run is removed again.
+      Interrupted: a signal came; the state is saved.
+      SaunaError: something failed; the last good checkpoint is on disk.
+    """
+    try:
+        if inexact and run.config.backend == "device":
+            raise BadInput("inexact: a run on the device brings its environments back exactly")
+        with disk_errors(run.path):
+            _train(run, display, resume, inexact)
+    except BadInput:
+        if not resume:  # what a worker found to be one before the first row: nothing is created
+            run_directory.discard(run.path, run.made)
+        raise
+    finally:
+        run.held.close()
+
+
+def _train(run: Run, display: Display, resume: bool, inexact: bool) -> None:
+    loaded = None
+    if resume:
+        if run_directory.is_complete(run.path):
+            display.say(f"{run.path} is complete; nothing to do")
+            return
+        loaded = _load(run, display)
+        run_directory.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+    with Coordinator(run, display, loaded, inexact) as coordinator:
+        coordinator.run()
+
+
+def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
+    """The newest checkpoint that is good, of this run, and whose rows are all there.
+
+    Raises:
+      BadInput: a checkpoint is of another run or environment; each field that differs is named.
+      BadCheckpoint: there are checkpoints, but none can be used.
+    """
+    own = run.manifest()
+
+    def check(manifest: dict[str, Any]) -> None:
+        _check_same(run.path, own, manifest)
+        run_directory.check_logs(run.path, manifest["logs"])
+
+    loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
+    before = loaded.manifest.get("versions", {}) if loaded else {}
+    changed = [f"{name} {before[name]} -> {own['versions'].get(name)}" for name in before
+               if before[name] != own["versions"].get(name)]  # fmt: skip
+    if changed:
+        display.say(f"warning: other versions than when the checkpoint was saved "
+                    f"({', '.join(changed)}): the rest may differ in its last bits")  # fmt: skip
+    return loaded
+
+
+def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> None:
+    """Refuses a checkpoint that another config or environment wrote.
+
+    Raises:
+      BadInput: with every field that differs.
+    """
+    stored = {**to_json(Config()), **manifest["config"]}  # a field added since had its default
+    differing = [
+        f"{name} is {stored[name]!r}, not {value!r}"
+        for name, value in own["config"].items()
+        if name not in (*RESUMABLE, "out") and stored[name] != value
+    ]
+    for name in ("spaces", "members"):
+        if manifest[name] != json.loads(json.dumps(own[name])):
+            differing.append(f"{name} differ")
+    if differing:
+        raise BadInput(f"{path}: its checkpoint is of another run or environment: "
+                       f"{'; '.join(differing)}")  # fmt: skip

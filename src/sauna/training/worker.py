@@ -1,0 +1,174 @@
+"""A process (or thread) that trains some of a run's members and tells the coordinator of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.jax_setup import configure_jax
+from sauna.system.processes import Shared, child_ends, receive, send
+
+if TYPE_CHECKING:
+    from sauna.training.loop.job import Job, Reporter
+
+BEAT = 2.0  # seconds between two signs of life
+
+
+class PipeReporter:
+    """Sends the loop's messages over a pipe; permissions come back over another.
+
+    The coordinator grants iterations, so that no process runs far ahead of the others and all can
+    stop at the same one. A coordinator that is gone ends the process.
+    """
+
+    def __init__(self, inbox: Connection, outbox: Shared, dies_alone: bool) -> None:
+        self._inbox, self._outbox, self._dies_alone = inbox, outbox, dies_alone
+        self._granted = 0
+        self._stop = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        try:
+            while True:
+                header = receive(self._inbox).header
+                with self._changed:
+                    self._granted = header["granted"]
+                    self._stop = header["stop"]
+                    self._changed.notify()
+        except (EOFError, OSError):
+            if self._dies_alone:
+                os._exit(1)
+            with self._changed:
+                self._stop, self._granted = True, 0
+                self._changed.notify()
+
+    def phase(self, text: str) -> None:
+        send(self._outbox, {"kind": "phase", "text": text})
+
+    def allowance(self, iteration: int) -> int:
+        with self._changed:
+            self._changed.wait_for(lambda: self._stop or iteration < self._granted)
+            return max(self._granted - iteration, 0)
+
+    def iteration(
+        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
+    ) -> None:
+        header = {"kind": "iteration", "iteration": iteration, "rows": rows, "timing": timing}
+        send(self._outbox, header)
+
+    def state(self, iteration: int, arrays: dict[str, np.ndarray]) -> None:
+        send(self._outbox, {"kind": "state", "iteration": iteration}, arrays)
+
+
+def _beat(outbox: Shared) -> None:
+    """Signs of life, also while an environment or the compiler takes its time."""
+    try:
+        while True:
+            send(outbox, {"kind": "alive"})
+            time.sleep(BEAT)
+    except OSError:
+        return  # nobody listens any more
+
+
+def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
+    """Receives a job, trains, and reports how it ended."""
+    outbox = Shared(outlet)
+    if dies_alone:
+        threading.Thread(target=_beat, args=(outbox,), daemon=True).start()
+    try:
+        header, arrays = receive(inbox)
+        send(outbox, {"kind": "phase", "text": "importing JAX"})
+        configure_jax(header["config"]["devices"], _device(header["config"]))
+        reporter = PipeReporter(inbox, outbox, dies_alone)
+        train_members(read_job(header, arrays), reporter)
+        send(outbox, {"kind": "done"})
+    except (EOFError, BrokenPipeError):
+        return
+    except SaunaError as error:
+        bad = isinstance(error, BadInput)
+        send(outbox, {"kind": "failure", "message": str(error), "bad_input": bad})
+    except Exception:
+        send(outbox, {"kind": "failure", "message": traceback.format_exc()})
+
+
+def train_members(job: Job, reporter: Reporter) -> None:
+    """Runs every iteration of the job's members, on the host or on the device.
+
+    Raises:
+      NonFinite: an update gave a non-finite loss or parameter; nothing of it was reported.
+      EnvironmentFailure: from the environments.
+    """
+    if job.config.backend == "device":
+        from sauna.training.loop.device import train_on_device
+
+        train_on_device(job, reporter)
+    else:
+        from sauna.training.loop.host import train_on_host
+
+        train_on_host(job, reporter)
+
+
+def _device(config: Mapping[str, Any]) -> str:
+    return "gpu" if config["backend"] == "device" and config["device"] == "gpu" else "cpu"
+
+
+def write_job(
+    config: dict[str, Any],
+    given: Mapping[str, Any],
+    spaces: tuple[Any, ...],
+    members: list[int],
+    drop_rates: list[list[float]],
+    start: int,
+    replay: bool,
+) -> dict[str, Any]:
+    """The header of the message that starts a worker; the arrays beside it are a checkpoint's."""
+    return {
+        "config": config,
+        "given": dict(given),
+        "spaces": list(spaces),
+        "members": members,
+        "drop_rates": drop_rates,
+        "start": start,
+        "replay": replay,
+    }
+
+
+def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
+    """The `Job` of a `write_job` header."""
+    import json
+
+    from sauna.config.presets import members, stored_config
+    from sauna.envs.spaces import read_spaces
+    from sauna.training.loop.job import Job
+
+    config = stored_config(header["config"])
+    everyone = members(config, header["given"])
+    return Job(
+        config=config,
+        spaces=read_spaces(header["spaces"]),
+        env_kwargs=json.loads(config.env_kwargs),
+        members=[everyone[index] for index in header["members"]],
+        drop_rates=header["drop_rates"],
+        restored=arrays or None,
+        start=header["start"],
+        replay=header["replay"],
+    )
+
+
+def main() -> None:
+    inbox, outbox = child_ends(sys.argv[1:])
+    serve(inbox, outbox, dies_alone=True)
+
+
+if __name__ == "__main__":
+    main()
