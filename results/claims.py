@@ -49,8 +49,15 @@ CLAIMS = (
         (("sauna 0.8", "random-drop"),),
     ),
 )
-HEADER = ["claim", "arm", "against", "tasks", "probability of improvement over the tasks [95%]",
-          "keep rate", "so"]  # fmt: skip
+HEADER = [
+    "claim",
+    "arm",
+    "against",
+    "tasks",
+    "probability of improvement over the tasks [95%]",
+    "keep rate",
+    "so",
+]
 
 
 def claims_rows(results: Mapping[str, Any]) -> list[list[str]]:
@@ -63,8 +70,10 @@ def claims_rows(results: Mapping[str, Any]) -> list[list[str]]:
     for claim in CLAIMS:
         for label, baseline in claim.pairs:
             cells = list(_ended(results, label, baseline))
-            pairs = {own["task"]: (_scores(own, claim.score), _scores(base, claim.score))
-                     for own, base in cells}  # fmt: skip
+            pairs = {
+                own["task"]: (_scores(own, claim.score), _scores(base, claim.score))
+                for own, base in cells
+            }
             keep_rates = [float(_scores(own, "keep_rate").mean()) for own, _ in cells]
             if pairs:
                 row = [
@@ -89,8 +98,9 @@ def _circumstances(cells: list[tuple[dict[str, Any], dict[str, Any]]], score: st
     )
     if failed:
         said += f"; {failed} failed seeds are left out"
-    ratios = [_scores(own, "env_steps").mean() / _scores(base, "env_steps").mean()
-              for own, base in cells]  # fmt: skip
+    ratios = [
+        _scores(own, "env_steps").mean() / _scores(base, "env_steps").mean() for own, base in cells
+    ]
     if score == "final_return" and max(ratios) > 1 + MORE_STEPS:
         said += f"; it took up to {max(ratios):.2f} times the env steps"
     return said
@@ -114,9 +124,9 @@ def count(results: Mapping[str, Any], claim: int, label: str) -> Count | None:
     cells, score = list(_ended(results, *pair)), CLAIMS[claim].score
     if not cells:
         return None
-    found = compare({
-        own["task"]: (_scores(own, score), _scores(base, score)) for own, base in cells
-    })  # fmt: skip
+    found = compare(
+        {own["task"]: (_scores(own, score), _scores(base, score)) for own, base in cells}
+    )
     kinds = [one.kind for one in found.values()]
     rates = [float(_scores(own, "keep_rate").mean()) for own, _ in cells]
     unfiltered = label != "vex-head" and min(rates) >= UNFILTERED
@@ -192,8 +202,11 @@ def _judged(
         [unversioned(task) for task, c in found.items() if c.kind == kind]
         for kind in ("better", "worse")
     )
-    idle = [unversioned(task) for task, rate in zip(found, keep_rates, strict=True)
-            if filters and rate >= UNFILTERED]  # fmt: skip
+    idle = [
+        unversioned(task)
+        for task, rate in zip(found, keep_rates, strict=True)
+        if filters and rate >= UNFILTERED
+    ]
     (over, *others) = (c.improvement for c in found.values())
     if others:
         over = improvement_over_tasks(list(pairs.values()))

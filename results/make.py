@@ -21,21 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages import (
-    MEASURED,
-    ROOT,
-    STUDIES,
-    findings,
-    index,
-    load,
-    noise_page,
-    page_of,
-    pong_text,
-    posture_page,
-    ppo_page,
-    study_page,
-    sweep_page,
-)
+from measured_pages import noise_page, posture_page, sweep_page
+from studies import MEASURED, ROOT, STUDIES, load, page_of
+from study_pages import pong_text, ppo_page, study_page
+from summary_page import findings, index
 
 from sauna.experiments.report.figures import draw_plots, write_figures
 from sauna.experiments.report.page import rounded
@@ -154,8 +143,11 @@ def write_pages() -> None:
             summary = summarize(results)
             figure(name, results, summary)
             (PAGES / page_of(name)).write_text(study_page(name, results, summary))
-    makers = {"noise": noise_page, "dial": sweep_page,
-              "fig5": lambda measured: posture_page(measured, STILLS.exists())}  # fmt: skip
+    makers = {
+        "noise": noise_page,
+        "dial": sweep_page,
+        "fig5": lambda measured: posture_page(measured, STILLS.exists()),
+    }
     for name, make in makers.items():
         if measured := load(name):
             measured_figures(name, measured)

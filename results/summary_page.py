@@ -1,0 +1,162 @@
+"""The first page of the results, and the table of claims that the README shows as well."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from claims import HEADER, Count, claims_rows, count, short_answer, told
+from measured_pages import noise_answer, posture_answer, sweep_answer
+from studies import (
+    CLAIMED,
+    FILES,
+    MEASURED,
+    ROOT,
+    STUDIES,
+    TITLES,
+    folded,
+    joined,
+    listed,
+    load,
+    markdown,
+    page_of,
+)
+
+from sauna.experiments.study.spec import load_spec
+
+# The summary's rows: what it says, the number of the claim, the arm that is judged.
+CLAIM_ROWS = (
+    ("SAUNA as the paper states it scores higher than PPO", 0, "sauna-paper"),
+    ("SAUNA as the authors' code does it scores higher than PPO", 0, "sauna-reference"),
+    ("The same with the budget in kept steps, as in their code", 0, "sauna-reference, kept steps"),
+    ("SAUNA corrected (threshold 0.3) scores higher than PPO", 0, "sauna"),
+    ("SAUNA at threshold 0.8, which drops more, scores higher than PPO", 0, "sauna 0.8"),
+    ("SAUNA at threshold 0.8 learns sooner (AUC)", 1, "sauna 0.8"),
+    ("Dropping steps helps, beyond the head trained beside it", 2, "sauna 0.8"),
+    ("The head helps even if nothing is dropped", 3, "vex-head"),
+    ("The filter chooses better than a matched random control", 4, "sauna 0.8"),
+)
+
+
+def findings(prefix: str) -> str:
+    """One table: what the paper says, a short answer, and the pages behind it.
+
+    Args:
+      prefix: path from the page that shows the table to `docs/results/`.
+    """
+    rows = [["Claim", "Answer", "Pages"]]
+    for text, claim, label in CLAIM_ROWS:
+        counts: dict[str, Count] = {}
+        pages = []
+        for name, tasks in CLAIMED.items():
+            found = count(results, claim, label) if (results := load(name)) else None
+            if found:
+                counts[tasks] = found
+                pages.append(_link(name, prefix))
+        if counts:
+            rows.append([f"{text} (`{label}`)", short_answer(counts), ", ".join(pages)])
+    said: tuple[tuple[str, str, Callable[[Mapping[str, Any]], str]], ...] = (
+        ("The dropped samples are noisier", "noise", noise_answer),
+        ("The threshold trades exploration for exploitation", "dial", sweep_answer),
+        ("HalfCheetah runs on its feet more often", "fig5", posture_answer),
+    )
+    for text, name, answer in said:
+        if measured := load(name):
+            rows.append([text, answer(measured), _link(name, prefix)])
+    return markdown(rows)
+
+
+def _link(name: str, prefix: str) -> str:
+    return f"[{FILES.get(name, name).replace('_', ' ')}]({prefix}{page_of(name)})"
+
+
+def index(covered: float) -> str:
+    """`docs/results/index.md`."""
+    return joined(
+        (
+            "# Results",
+            "Does SAUNA's filter help PPO? The table answers claim by claim. Each page begins with a "
+            "table and a figure.",
+            findings(""),
+            "*Better* and *worse* mean a decided comparison of two arms: the exact test rejects after "
+            "correction, and the interval leaves out one half "
+            "([how](../concepts/statistics.md)). *Not decided* is no evidence of equality.",
+            markdown([["Study", "Tasks", "Seeds", "Env steps", "Command"], *map(_scope, _all())]),
+            "## How to read the numbers",
+            listed(
+                (
+                    "A return is a **training return**: actions are sampled, and the mean is over the last "
+                    "100 episodes. No number here is a deterministic evaluation.",
+                    "The budget counts every env step, also the dropped ones. The label says so if an arm "
+                    "differs.",
+                    "**IQM** is the mean of the middle half of the seeds. Its interval is a bootstrap, "
+                    f"which is too narrow with six seeds: it holds the truth {covered:.0%} of the time "
+                    "(`python results/intervals.py`). No verdict uses it.",
+                    "The paper's numbers are of version 2 of the tasks and of kept steps. Compare arms "
+                    "within a table, not across.",
+                    "A family of tests is corrected by Holm's method. Nothing is corrected for the number "
+                    "of tables.",
+                )
+            ),
+            _revisions(),
+            "`python results/make.py` makes these pages from the files in `results/`. "
+            "`make results` trains what is missing first, which takes many hours.",
+            "## The claims, study by study",
+            *_claims(),
+        )
+    )
+
+
+def _all() -> list[str]:
+    return [name for name in (*STUDIES, *MEASURED) if load(name)]
+
+
+def _scope(name: str) -> list[str]:
+    spec = load_spec(name)
+    seeds = {len(arm.seeds) for arm in spec.arms}
+    tasks = list(dict.fromkeys(task for arm in spec.arms for task in arm.tasks))
+    steps = load(name)["cells"][0].get("steps") or load(name)["settings"]["steps"]
+    return [
+        f"[{TITLES[name]}]({page_of(name)})",
+        tasks[0] if len(tasks) == 1 else str(len(tasks)),
+        str(max(seeds)),
+        f"{int(steps):,}",
+        f"`sauna study {name}`",
+    ]
+
+
+def _revisions() -> str:
+    """Whether runs of several revisions of the package can be compared."""
+    path = ROOT / "results" / "revisions.json"
+    if not path.exists():
+        return ""
+    stored = json.loads(path.read_text())
+    equal = sum(len(run["equal"]) for run in stored["runs"])
+    number_of = sum(len(run["env_steps"]) for run in stored["runs"])
+    return folded(
+        "Several revisions of the package trained these runs",
+        "Two runs of every study, arm and revision were begun again by revision "
+        f"{stored['now']} (`{stored['command']}`). Up to the second point of the curves, {equal} "
+        f"of {number_of} gave the same numbers. Random controls were left out, because they "
+        "need whole runs of others.",
+    )
+
+
+def _claims() -> list[str]:
+    about = (
+        "Each row is a family of exact tests, one for each task, corrected by Holm's method. "
+        "*By the interval* describes the tasks together: the 95% interval of the probability of "
+        "improvement leaves out one half. That is no test, and nothing corrects it. A pair of arms "
+        "is judged on the tasks that both have finished."
+    )
+    parts = [about]
+    for name in CLAIMED:
+        rows = claims_rows(results) if (results := load(name)) else []
+        if rows:
+            again = [False, *(row[0] == other[0] for row, other in itertools.pairwise(rows))]
+            shown = [["", *row[1:]] if same else row for row, same in zip(rows, again, strict=True)]
+            text = f"{listed(told(rows))}\n\n{markdown([HEADER, *shown])}"
+            parts.append(folded(TITLES[name], text))
+    return parts
