@@ -7,68 +7,41 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from studies import TITLES, WHY, folded, joined, listed, markdown, shown_label
+from studies import TITLES, WHY, markdown, page, shown_label
 
 from sauna.experiments.measure import coverage_report, noise_report, posture_report
 from sauna.experiments.statistics import ALPHA, holm
 
+FRAMES = """![Frames of one pair of seeds](figures/fig5_stills.png)
+
+*One pair, chosen for its contrast: the first seed of which only `sauna 0.8` is on its feet.*"""
+
 
 def noise_page(measured: Mapping[str, Any]) -> str:
-    """Signal and noise of the policy gradient, kept against dropped against random."""
-    rows = [
-        [
-            "Task",
-            "Arm",
-            "Keep rate",
-            "Variance of dropped steps, control = 1",
-            "Signal to noise, dropped - control",
-            "By variance",
-            "By signal to noise",
-        ]
+    """Signal and noise of the policy gradient: kept, dropped, and random steps."""
+    head = [
+        "Task",
+        "Arm",
+        "Keep rate",
+        "Variance of dropped steps, control = 1",
+        "Signal to noise, dropped - control",
+        "By variance",
+        "By signal to noise",
     ]
-    full = noise_report.text_table(measured)
-    for row in full[1:]:
-        by_variance, by_signal = _noise_kinds(row)
-        rows.append([row[0], shown_label(row[1]), row[3], row[14], row[7], by_variance, by_signal])
-    return joined(
-        (
-            f"# {TITLES['noise']}",
-            WHY["noise"],
-            "`sauna study noise`: 6 seeds per arm, 10^6 env steps, five checkpoints each. In "
-            "brackets: 95% interval over the seeds.",
-            markdown(rows),
-            f"{noise_answer(measured)}. Variance is the trace of the gradient's covariance with raw "
-            "advantages. Signal to noise is the squared length of the mean gradient over that trace, "
-            "for one minibatch, with advantages as in training. The control drops as many steps at "
-            "random.",
-            "![Variance of a minibatch's gradient](figures/noise_variance.png)",
-            "*The group's variance over the variance of what the random control keeps. Line: geometric "
-            "mean of the members. Band: 95% interval.*",
-            "With advantages standardised as in training, minibatches of kept steps have "
-            + _listed_and(
-                f"{row[12].split(' ')[0]} ({row[0]}, {shown_label(row[1])})" for row in full[1:]
-            )
-            + " times the variance of the control's.",
-            folded("All measurements", _full_noise(full)),
-            folded(
-                "How it is measured",
-                listed(
-                    (
-                        "At a checkpoint, 64 fresh and independent streams of env steps are collected with the "
-                        "policy, the head and the normaliser of that time.",
-                        "Half of the streams give the reference: the policy gradient of all steps.",
-                        "Each of the others gives 64 minibatches of kept steps, of dropped steps, of steps "
-                        "that a random control keeps, and of *shifted* ones.",
-                        "Shifted steps are dropped by the filter's decisions moved in time: as many and as "
-                        "bunched, but not chosen by the head.",
-                        "The cosine compares a minibatch's gradient with the reference. The alignment is that "
-                        "cosine for endless minibatches: below 1 means bias.",
-                        "Intervals are Student's t over the seeds, each the mean of its checkpoints. They are "
-                        "not corrected for their number.",
-                    )
-                ),
-            ),
-        )
+    full = noise_report.text_table(measured)[1:]
+    rows = [
+        [row[0], shown_label(row[1]), row[3], row[14], row[7], *_noise_kinds(row)] for row in full
+    ]
+    return page(
+        "noise",
+        title=TITLES["noise"],
+        why=WHY["noise"],
+        table=markdown([head, *rows]),
+        answer=noise_answer(measured),
+        kept=_listed_and(
+            f"{row[12].split(' ')[0]} ({row[0]}, {shown_label(row[1])})" for row in full
+        ),
+        everything=_full_noise(full),
     )
 
 
@@ -77,28 +50,30 @@ def _listed_and(parts: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
+NOISE_HEAD = (
+    "Task",
+    "Arm",
+    "Members",
+    "Keep rate",
+    "SNR kept",
+    "SNR control",
+    "SNR dropped",
+    "SNR dropped - control",
+    "SNR dropped - shifted",
+    "SNR per env step, kept - control",
+    "Cosine dropped - control",
+    "Alignment of kept, checkpoints",
+    "Variance, kept / control",
+    "Raw variance, kept / control",
+    "Raw variance, dropped / control",
+    "Raw variance, dropped / shifted",
+)
+
+
 def _full_noise(full: list[list[str]]) -> str:
-    head = [
-        "Task",
-        "Arm",
-        "Members",
-        "Keep rate",
-        "SNR kept",
-        "SNR control",
-        "SNR dropped",
-        "SNR dropped - control",
-        "SNR dropped - shifted",
-        "SNR per env step, kept - control",
-        "Cosine dropped - control",
-        "Alignment of kept, checkpoints",
-        "Variance, kept / control",
-        "Raw variance, kept / control",
-        "Raw variance, dropped / control",
-        "Raw variance, dropped / shifted",
-    ]
-    rows = zip(*[head, *([row[0], shown_label(row[1]), *row[2:]] for row in full[1:])], strict=True)
-    turned = [list(row) for row in rows]
-    return markdown([turned[0], *turned[1:]])
+    """All columns of the report, as rows: there are more measurements than arms."""
+    arms = [[row[0], shown_label(row[1]), *row[2:]] for row in full]
+    return markdown([list(row) for row in zip(NOISE_HEAD, *arms, strict=True)])
 
 
 def _noise_kinds(row: list[str]) -> tuple[str, str]:
@@ -140,8 +115,7 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
         marks = coverage_report.marks(measured, task)
         correlations.append([task, *_correlations(marks)])
         controls += [[task, *row] for row in _beside_controls(marks)]
-    arms = coverage_report.text_table(measured)
-    arms[0] = [
+    head = [
         "Task",
         "Arm",
         "Members",
@@ -151,30 +125,16 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
         "State coverage",
         "Final return",
     ]
-    return joined(
-        (
-            f"# {TITLES['dial']}",
-            WHY["dial"],
-            "`sauna study dial`: 4 seeds per arm, 10^6 env steps. The entropy is the mean over "
-            "training, in nats. The return is the training return of the last 100 episodes.",
-            markdown(correlations),
-            "Rank correlation of each quantity with the threshold, over the members of arms with a "
-            "constant threshold. The p value is corrected by Holm's method for the three quantities.",
-            "![State coverage against the threshold](figures/dial_coverage.png)",
-            "*State coverage: the entropy of the visited observations, by nearest neighbours, in one "
-            "scale for all arms. Point: mean of the members. Band: 95% interval.*",
-            "## Is it the threshold, or only fewer updates?",
-            "A higher threshold keeps fewer steps, so it also learns from fewer. The matched random "
-            "control drops as many steps at random.",
-            markdown(controls),
-            "Threshold minus random control, mean over pairs with the same drop rates, 95% interval. "
-            "*Differs in* names the quantities whose interval leaves out 0. Nothing corrects their "
-            "number.",
-            folded(
-                "All arms",
-                markdown([arms[0], *([r[0], shown_label(r[1]), *r[2:]] for r in arms[1:])]),
-            ),
-        )
+    arms = [
+        [row[0], shown_label(row[1]), *row[2:]] for row in coverage_report.text_table(measured)[1:]
+    ]
+    return page(
+        "threshold_sweep",
+        title=TITLES["dial"],
+        why=WHY["dial"],
+        correlations=markdown(correlations),
+        controls=markdown(controls),
+        arms=markdown([head, *arms]),
     )
 
 
@@ -234,36 +194,17 @@ def posture_page(measured: Mapping[str, Any], stills: bool) -> str:
         "Return on its back",
     ]
     pairs = [["Arm", "Against", "Pairs", "Only the arm on its feet", "Only the other", "p"]]
-    pairs += [
-        [
-            pair.label,
-            pair.baseline,
-            str(pair.seeds),
-            str(pair.gained),
-            str(pair.lost),
-            f"{pair.p:.3f}",
-        ]
-        for pair in posture_report.pairs(measured)
-        if pair.seeds
-    ]
-    return joined(
-        (
-            f"# {TITLES['fig5']}",
-            WHY["fig5"],
-            "`sauna study fig5`: HalfCheetah-v5, 30 seeds per arm, 10^6 env steps. The finished policy "
-            "plays five episodes with sampled actions and a frozen normaliser.",
-            markdown([head, *rows]),
-            "A seed is on its feet if the cosine of the torso's pitch is positive in more than half of "
-            "the states. *Between*: upright in 10% to 90% of the states. The interval is Wilson's.",
-            markdown(pairs),
-            f"Seeds are paired: both arms of a pair begin with the same weights and resets. The test "
-            f"is McNemar's exact test. The answer: {posture_answer(measured)}.",
-            "![Frames of one pair of seeds](figures/fig5_stills.png)" if stills else "",
-            "*One pair, chosen for its contrast: the first seed of which only `sauna 0.8` is on its "
-            "feet.*"
-            if stills
-            else "",
-        )
+    for pair in posture_report.pairs(measured):
+        counts = (str(pair.seeds), str(pair.gained), str(pair.lost), f"{pair.p:.3f}")
+        pairs.append([pair.label, pair.baseline, *counts])
+    return page(
+        "posture",
+        title=TITLES["fig5"],
+        why=WHY["fig5"],
+        table=markdown([head, *rows]),
+        pairs=markdown(pairs),
+        answer=posture_answer(measured),
+        frames=FRAMES if stills else "",
     )
 
 

@@ -1,8 +1,9 @@
-"""The studies whose results are in the repository, and how pages of them are put together."""
+"""The studies whose results are in the repository, and how their pages are put together."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -83,5 +84,7 @@ def folded(title: str, text: str) -> str:
     return f'<details markdown="1"><summary>{title}</summary>\n\n{text}\n\n</details>'
 
 
-def joined(parts: Iterable[str]) -> str:
-    return "\n\n".join(part for part in parts if part) + "\n"
+def page(template: str, **parts: str) -> str:
+    """`templates/TEMPLATE.md` with its `{parts}` filled in; an empty part leaves no gap."""
+    text = (Path(__file__).parent / "templates" / f"{template}.md").read_text().format(**parts)
+    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"

@@ -10,12 +10,16 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from studies import DECIDED, TITLES, WHY, folded, joined, listed, markdown, shown_label
+from studies import DECIDED, TITLES, WHY, folded, listed, markdown, page, shown_label
 
 from sauna.experiments.report.numbers import digits_of, digits_of_tasks, interval, number
 from sauna.experiments.study.spec import load_spec
 from sauna.experiments.study.tables import PAPER, unversioned
 
+CAPTION = (
+    "*Training return, mean of the last 100 episodes. Line: mean of the seeds. Band: 95% interval "
+    "of the mean.*"
+)
 # PPO's published means for 10^6 steps, for orientation: the paper's Table 1 and baselines on v2
 # tasks, CleanRL on v4 tasks.
 PUBLISHED = {
@@ -30,28 +34,22 @@ PUBLISHED = {
 
 def study_page(name: str, results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     """A study's page: table, figure, decided comparisons; the rest is folded."""
-    verdicts = [*summary["verdicts"], *summary["filtering"]]
-    return joined(
-        (
-            f"# {TITLES[name]}",
-            WHY[name],
-            _facts(results) + (f" {pong_text(results)}" if name == "pong" else ""),
-            overview(results, summary),
-            _legend(summary),
-            f"![Learning curves: {TITLES[name]}](figures/{name}.svg)",
-            "*Training return, mean of the last 100 episodes. Line: mean of the seeds. Band: 95% "
-            "interval of the mean.*"
-            if len(summary["table"]) > 1
-            else "",
-            _decided(verdicts),
-            _missing(name, results),
-            _same_runs(results),
-            *(
-                _of_task(task, name, results, summary)
-                for task in summary["curves"]
-                if len(summary["table"]) > 1
-            ),
-        )
+    alone = len(summary["table"]) == 1
+    about = f" {pong_text(results)}" if name == "pong" else ""
+    tasks = "\n\n".join(_of_task(task, name, results, summary) for task in summary["curves"])
+    return page(
+        "study",
+        name=name,
+        title=TITLES[name],
+        why=WHY[name],
+        facts=_facts(results) + about,
+        overview=overview(results, summary),
+        legend="" if alone else _legend(summary),
+        caption="" if alone else CAPTION,
+        decided=_decided([*summary["verdicts"], *summary["filtering"]]),
+        missing=_missing(name, results),
+        same_runs=_same_runs(results),
+        tasks="" if alone else tasks,
     )
 
 
@@ -98,8 +96,6 @@ def _column(task: str) -> str:
 
 
 def _legend(summary: Mapping[str, Any]) -> str:
-    if len(summary["table"]) < 2:
-        return ""
     ends = any(row["label"] == "ppo, limits end" for row in summary["table"])
     return (
         "IQM of the seeds' final returns. **better** and **worse** mark decided comparisons with "
@@ -262,17 +258,7 @@ def ppo_table(results: Mapping[str, Any]) -> str:
 
 def ppo_page(results: Mapping[str, Any]) -> str:
     """`docs/results/ppo.md`."""
-    return joined(
-        (
-            "# PPO beside published numbers",
-            "Preset `mujoco`, 10^6 env steps, 6 seeds, from the study `fig3`. The number is the mean "
-            "training return of the last 100 episodes.",
-            ppo_table(results),
-            "The last three columns are published means on older versions of the tasks, for "
-            "orientation only: their metrics and versions differ. *Limits end*: a time limit counts as "
-            "the end of the episode, as in OpenAI baselines.",
-        )
-    )
+    return page("ppo", table=ppo_table(results))
 
 
 def pong_text(results: Mapping[str, Any]) -> str:

@@ -17,10 +17,10 @@ from studies import (
     STUDIES,
     TITLES,
     folded,
-    joined,
     listed,
     load,
     markdown,
+    page,
     page_of,
 )
 
@@ -74,38 +74,14 @@ def _link(name: str, prefix: str) -> str:
 
 def index(covered: float) -> str:
     """`docs/results/index.md`."""
-    return joined(
-        (
-            "# Results",
-            "Does SAUNA's filter help PPO? The table answers claim by claim. Each page begins with a "
-            "table and a figure.",
-            findings(""),
-            "*Better* and *worse* mean a decided comparison of two arms: the exact test rejects after "
-            "correction, and the interval leaves out one half "
-            "([how](../concepts/statistics.md)). *Not decided* is no evidence of equality.",
-            markdown([["Study", "Tasks", "Seeds", "Env steps", "Command"], *map(_scope, _all())]),
-            "## How to read the numbers",
-            listed(
-                (
-                    "A return is a **training return**: actions are sampled, and the mean is over the last "
-                    "100 episodes. No number here is a deterministic evaluation.",
-                    "The budget counts every env step, also the dropped ones. The label says so if an arm "
-                    "differs.",
-                    "**IQM** is the mean of the middle half of the seeds. Its interval is a bootstrap, "
-                    f"which is too narrow with six seeds: it holds the truth {covered:.0%} of the time "
-                    "(`python results/intervals.py`). No verdict uses it.",
-                    "The paper's numbers are of version 2 of the tasks and of kept steps. Compare arms "
-                    "within a table, not across.",
-                    "A family of tests is corrected by Holm's method. Nothing is corrected for the number "
-                    "of tables.",
-                )
-            ),
-            _revisions(),
-            "`python results/make.py` makes these pages from the files in `results/`. "
-            "`make results` trains what is missing first, which takes many hours.",
-            "## The claims, study by study",
-            *_claims(),
-        )
+    head = ["Study", "Tasks", "Seeds", "Env steps", "Command"]
+    return page(
+        "index",
+        findings=findings(""),
+        studies=markdown([head, *map(_scope, _all())]),
+        covered=f"{covered:.0%}",
+        revisions=_revisions(),
+        claims="\n\n".join(_claims()),
     )
 
 
@@ -145,13 +121,8 @@ def _revisions() -> str:
 
 
 def _claims() -> list[str]:
-    about = (
-        "Each row is a family of exact tests, one for each task, corrected by Holm's method. "
-        "*By the interval* describes the tasks together: the 95% interval of the probability of "
-        "improvement leaves out one half. That is no test, and nothing corrects it. A pair of arms "
-        "is judged on the tasks that both have finished."
-    )
-    parts = [about]
+    """Each study's verdicts on the claims, folded."""
+    parts = []
     for name in CLAIMED:
         rows = claims_rows(results) if (results := load(name)) else []
         if rows:
