@@ -1,10 +1,11 @@
 # make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
 # make test   install into .venv, run the tests
 # make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
-# make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
+# make campaign  every fault of docs/concepts/reliability.md in full (hours; continues where it stopped)
 # make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
 # make cost   what checks and checkpoints take of a training
+# make docs   build the documentation site into site/; a broken link is an error
 # make lint   style, format and types
 # make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
 
@@ -12,7 +13,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: setup demo test test-slow campaign mutants soak cost lint results clean
+.PHONY: setup demo test test-slow campaign mutants soak cost docs lint results clean
 
 .venv/bin/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
@@ -29,6 +30,10 @@ BIN := .venv/bin
 .venv/.slow: .venv/bin/python pyproject.toml
 	$(BIN)/pip install --quiet -e '.[dev,cluster,brax,playground]'
 	@touch $@ .venv/.dev .venv/.run
+
+.venv/.docs: .venv/bin/python pyproject.toml
+	$(BIN)/pip install --quiet -e '.[docs]'
+	@touch $@ .venv/.run
 
 setup: .venv/.dev
 
@@ -53,6 +58,9 @@ soak: .venv/.dev
 
 cost: .venv/.dev
 	$(BIN)/python tests/faults/cost.py
+
+docs: .venv/.docs
+	$(BIN)/mkdocs build --strict
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

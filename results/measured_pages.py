@@ -34,6 +34,7 @@ def noise_page(measured: Mapping[str, Any]) -> str:
     ]
     return page(
         "noise",
+        command=measured["command"],
         title=TITLES["noise"],
         why=WHY["noise"],
         table=markdown([head, *rows]),
@@ -98,7 +99,7 @@ def noise_answer(measured: Mapping[str, Any]) -> str:
     for place, name in ((0, "by variance"), (1, "by signal to noise")):
         found = [kind[place] for kind in kinds]
         counts = [(found.count(word), word) for word in ("noisier", "less noisy")]
-        said = ", ".join(f"{word} in {n} of {len(found)}" for n, word in counts if n)
+        said = ", ".join(f"{word} in {n} of {len(found)} cases" for n, word in counts if n)
         yes, no = counts[0][0], counts[1][0]
         word = "yes" if yes and not no else "no" if no and not yes else "mixed" if yes else ""
         answers.append(f"**{word or 'not decided'}** {name}" + (f" ({said})" if said else ""))
@@ -130,6 +131,7 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
     ]
     return page(
         "threshold_sweep",
+        command=measured["command"],
         title=TITLES["dial"],
         why=WHY["dial"],
         correlations=markdown(correlations),
@@ -199,6 +201,7 @@ def posture_page(measured: Mapping[str, Any], stills: bool) -> str:
         pairs.append([pair.label, pair.baseline, *counts])
     return page(
         "posture",
+        command=measured["command"],
         title=TITLES["fig5"],
         why=WHY["fig5"],
         table=markdown([head, *rows]),

@@ -99,7 +99,7 @@ def _scope(name: str) -> list[str]:
         tasks[0] if len(tasks) == 1 else str(len(tasks)),
         str(max(seeds)),
         f"{int(steps):,}",
-        f"`sauna study {name}`",
+        f"`{load(name)['command']}`",
     ]
 
 
