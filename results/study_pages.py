@@ -6,6 +6,7 @@ Everything else is folded, task by task.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -92,7 +93,9 @@ def overview(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
 
 
 def _column(task: str) -> str:
-    return unversioned(task).removeprefix("gymnax/").removesuffix("-MinAtar")
+    """A task's name, which may break at its capitals."""
+    name = unversioned(task).removeprefix("gymnax/").removesuffix("-MinAtar")
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "&shy;", name)
 
 
 def _legend(summary: Mapping[str, Any]) -> str:
