@@ -35,10 +35,14 @@ EPISODES = 60
 TRAIN_STEPS = 20_480
 THROWN_FROM_AHEAD = 26  # a seed
 GROUPS = {
-    "height - 0.8": [0], "sine, cosine of the flag": [1, 2], "velocity x 0.3": [3, 4, 5],
-    "roll, pitch": [6, 7], "joint positions": list(range(8, 42, 2)),
-    "joint speeds x 0.1": list(range(9, 42, 2)), "foot contacts": [42, 43],
-}  # fmt: skip
+    "height - 0.8": [0],
+    "sine, cosine of the flag": [1, 2],
+    "velocity x 0.3": [3, 4, 5],
+    "roll, pitch": [6, 7],
+    "joint positions": list(range(8, 42, 2)),
+    "joint speeds x 0.1": list(range(9, 42, 2)),
+    "foot contacts": [42, 43],
+}
 TERMS = ("alive", "progress", "electricity and stall torque", "joints at their limits")
 
 
@@ -48,8 +52,11 @@ def play(name: str, policy: str) -> dict[str, Any]:
     episodes, observations = [], []
     for seed in range(EPISODES):
         rng = np.random.default_rng(seed)
-        act = (lambda: np.zeros(17, np.float32)) if policy == "zero" else (
-            lambda rng=rng: rng.uniform(-1, 1, 17).astype(np.float32))  # fmt: skip
+        act = (
+            (lambda: np.zeros(17, np.float32))
+            if policy == "zero"
+            else (lambda rng=rng: rng.uniform(-1, 1, 17).astype(np.float32))
+        )
         episode, seen = play_episode(env, seed, act)
         episodes.append(episode)
         observations += seen

@@ -88,8 +88,16 @@ def main() -> None:
         wanted = {seed: curve["env_steps"][1] for seed, curve in members.items()}
         rows = again(arm, cell["task"], wanted)
         equal = [seed for seed, curve in members.items() if is_equal(rows.get(seed), curve)]
-        found.append({"study": name, "arm": arm.label, "task": cell["task"], "revision": revision,
-                      "env_steps": wanted, "equal": equal})  # fmt: skip
+        found.append(
+            {
+                "study": name,
+                "arm": arm.label,
+                "task": cell["task"],
+                "revision": revision,
+                "env_steps": wanted,
+                "equal": equal,
+            }
+        )
         print(found[-1], flush=True)
     now = shown(run_directory.git_revision() or "")
     result = {"command": "python results/revisions.py", "now": now, "runs": found}

@@ -13,6 +13,7 @@ import numpy as np
 from sauna.algorithm.rollout.program import Program, make_program
 from sauna.config.presets import members, resolve
 from sauna.config.settings import Config
+from sauna.envs.host.contract import Step
 from sauna.training.loop.job import Job
 from sauna.training.loop.member_state import flat_params
 from sauna.training.prepare import look_at, placed, settle
@@ -93,7 +94,7 @@ def policy_output(job: Job, arrays: dict[str, np.ndarray], member: str, observat
     import jax
 
     program: Program = make_program(job.config, job.spaces)
-    example = program.init(jax.random.key(0)).params
+    example = program.policy.init(jax.random.key(0))
     prefix = f"{member}/params/"
     named = {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
     params = flat_params(program.policy, example, named)
@@ -113,3 +114,10 @@ def equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
 
 def own(arrays: dict[str, np.ndarray], member: str) -> dict[str, np.ndarray]:
     return {k[len(member) :]: v for k, v in arrays.items() if k.startswith(member + "/")}
+
+
+def assert_same_step(one: Step, two: Step) -> None:
+    ended = one.terminated | one.truncated
+    for a, b in zip(one[:4], two[:4], strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])

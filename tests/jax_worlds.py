@@ -171,6 +171,8 @@ too_long = Filter(lambda n, room: (), lambda s, o, vex, k, h: (s, jnp.append(vex
 forgetting = Filter(lambda n, room: jnp.zeros(n), lambda s, o, vex, k, h: (s.sum(), vex > 0))
 # And without: Python numbers as a state, and numpy where nothing is traced.
 smoothed = Filter(lambda n, room: 0, lambda s, o, vex, k, h: (0.9 * s + vex.mean(), vex >= s))
-by_numpy = Filter(lambda n, room: jnp.asarray(np.asarray(jnp.zeros(n))),
-                  lambda s, o, vex, k, h: (s + vex, vex >= s))  # fmt: skip
+by_numpy = Filter(
+    lambda n, room: jnp.asarray(np.asarray(jnp.zeros(n))),
+    lambda s, o, vex, k, h: (s + vex, vex >= s),
+)
 summed = VexTarget(lambda return_, value, weight, episode: jnp.sum(return_ - value))

@@ -28,18 +28,39 @@ ROOT = Path(__file__).parent.parent
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     run = tmp_path_factory.mktemp("api") / "run"
-    return sauna.train("worlds:Scripted", quiet=True, out=run, tensorboard=True,
-                       **{**SMALL, "seeds": 2})  # fmt: skip
+    return sauna.train(
+        "worlds:Scripted", quiet=True, out=run, tensorboard=True, **{**SMALL, "seeds": 2}
+    )
 
 
 def test_rows_hold_every_metric(result) -> None:
     expected = {
-        "member", "arm", "seed", "iteration", "env_steps", "kept_steps", "keep_rate", "episodes",
-        "episode_returns", "episode_lengths", "episode_truncated", "return_mean", "policy_loss",
-        "value_loss", "vex_loss", "entropy", "kl", "clip_fraction", "gradient_norm",
-        "explained_variance", "vex_target", "vex_mean", "vex_spread", "vex_median",
+        "member",
+        "arm",
+        "seed",
+        "iteration",
+        "env_steps",
+        "kept_steps",
+        "keep_rate",
+        "episodes",
+        "episode_returns",
+        "episode_lengths",
+        "episode_truncated",
+        "return_mean",
+        "policy_loss",
+        "value_loss",
+        "vex_loss",
+        "entropy",
+        "kl",
+        "clip_fraction",
+        "gradient_norm",
+        "explained_variance",
+        "vex_target",
+        "vex_mean",
+        "vex_spread",
+        "vex_median",
         "learning_rate",
-    }  # fmt: skip
+    }
     for row in result.metrics:
         assert set(row) == expected
         assert all(math.isfinite(v) for v in row.values() if isinstance(v, float))
@@ -126,8 +147,16 @@ def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
 def test_videos_are_written_and_read_back(tmp_path) -> None:
     import imageio.v3 as imageio
 
-    run = sauna.train("worlds:Picture", quiet=True, out=tmp_path / "run", arm="ppo",
-                      rollout_steps=8, minibatches=2, epochs=1, steps=8)  # fmt: skip
+    run = sauna.train(
+        "worlds:Picture",
+        quiet=True,
+        out=tmp_path / "run",
+        arm="ppo",
+        rollout_steps=8,
+        minibatches=2,
+        epochs=1,
+        steps=8,
+    )
     played = sauna.evaluate(run.path, episodes=1, video=True)
     frames = imageio.imread(played["video"])
     assert frames.shape[0] == 5 and frames.shape[3] == 3
@@ -141,21 +170,28 @@ def test_no_video_is_said_plainly(result) -> None:
 
 
 def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_path) -> None:
-    other = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run", env_processes=2,
-                        processes=1, **{**SMALL, "seeds": 2})  # fmt: skip
+    other = sauna.train(
+        "worlds:Scripted",
+        quiet=True,
+        out=tmp_path / "run",
+        env_processes=2,
+        processes=1,
+        **{**SMALL, "seeds": 2},
+    )
     assert other.metrics == result.metrics
 
 
 def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
-    """The code block of docs/plugins.md, as it stands there, from the command line."""
-    text = (ROOT / "docs" / "plugins.md").read_text()
-    code = text.split("```python\n")[1].split("```")[0]
+    """The file of docs/how-to/own_selection_rule.md, as it stands there, from the command line."""
+    text = (ROOT / "docs" / "how-to" / "own_selection_rule.md").read_text()
+    code = text.split('```python title="my_filters.py"\n')[1].split("```")[0]
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
     (tmp_path / "my_filters.py").write_text(code)
     command = next(line for line in text.splitlines() if line.startswith("sauna train"))
     arguments = [*command.split()[1:], "--out", "run", "--steps", "4096", "--seeds", "2"]
-    done = subprocess.run([sys.executable, "-m", "sauna", *arguments], cwd=tmp_path,
-                          capture_output=True, text=True)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "sauna", *arguments], cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in run_directory.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
@@ -169,17 +205,25 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
 
 @pytest.mark.parametrize("name", ["smoothed", "by_numpy"])
 def test_filters_of_ones_own_may_be_plain(name: str, tmp_path) -> None:
-    run = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run", arm="sauna",
-                      filter=f"jax_worlds:{name}", **SMALL)  # fmt: skip
+    run = sauna.train(
+        "worlds:Scripted",
+        quiet=True,
+        out=tmp_path / "run",
+        arm="sauna",
+        filter=f"jax_worlds:{name}",
+        **SMALL,
+    )
     assert all(0 < row["keep_rate"] <= 1 for row in run.metrics)
 
 
 def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
-    text = (ROOT / "docs" / "plugins.md").read_text()
-    (tmp_path / "my_targets.py").write_text(text.split("```python\n")[2].split("```")[0])
+    text = (ROOT / "docs" / "how-to" / "own_vex_target.md").read_text()
+    code = text.split('```python title="my_targets.py"\n')[1].split("```")[0]
+    (tmp_path / "my_targets.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    run = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run",
-                      vex_target="my_targets:sign", **SMALL)  # fmt: skip
+    run = sauna.train(
+        "worlds:Scripted", quiet=True, out=tmp_path / "run", vex_target="my_targets:sign", **SMALL
+    )
     assert all(0 <= row["vex_target"] <= 1 for row in run.metrics)
 
 
@@ -190,16 +234,23 @@ def test_python_values_of_all_kinds_are_taken(tmp_path) -> None:
         "steps": np.int64(64),
         "learning_rate": np.float32(1),
     }
-    run = sauna.train("worlds:Scripted", quiet=True, out=tmp_path / "run", arm=["ppo"],
-                      env_kwargs={}, **{**settings, "hidden": None})  # fmt: skip
+    run = sauna.train(
+        "worlds:Scripted",
+        quiet=True,
+        out=tmp_path / "run",
+        arm=["ppo"],
+        env_kwargs={},
+        **{**settings, "hidden": None},
+    )
     assert set(run.summary) == {"ppo/3", "ppo/4"}
 
 
 def test_curves_and_their_interval() -> None:
     rows = [
         {"arm": "ppo", "member": f"ppo/{s}", "env_steps": x, "return_mean": float(s + x)}
-        for s in (0, 2) for x in (1, 2)
-    ]  # fmt: skip
+        for s in (0, 2)
+        for x in (1, 2)
+    ]
     curves = member_curves([*rows, {"arm": "ppo", "member": "ppo/0", "env_steps": 3}])
     np.testing.assert_array_equal(curves["ppo"]["ppo/2"][1], [3.0, 4.0])
     low, high = interval(np.array([[1.0], [3.0]]))

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from helpers import SMALL, environment
+from command_line import sauna, small_flags
 from sauna import cli
 from sauna.config.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
 from sauna.config.settings import FIELDS, flag, parse, to_json
@@ -18,17 +17,6 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
 WORLD = "worlds:Scripted"
-
-
-def sauna(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "sauna", *arguments],
-        capture_output=True, text=True, cwd=cwd, env=environment(),
-    )  # fmt: skip
-
-
-def small_flags(**changes: object) -> list[str]:
-    return [f"{flag(k)}={v}" for k, v in {**SMALL, **changes}.items()]
 
 
 BAD = [
@@ -110,8 +98,9 @@ def test_bad_input_is_found_without_importing_jax(tmp_path) -> None:
         "try: sauna.cli.main(['train', 'Hopper-v5', '--minibatches', '7'])\n"
         "except SystemExit as e: print(e.code, 'jax' in sys.modules, 'flax' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
-                          cwd=tmp_path)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.stdout.split() == ["2", "False", "False"]
 
 
@@ -121,9 +110,14 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     assert "compiling" in done.stdout and "sauna/1: return" in done.stdout
     assert {p.name for p in run.iterdir()} == {
-        ".lock", "checkpoints", "config.json", "figures", "metrics.jsonl", "summary.json",
+        ".lock",
+        "checkpoints",
+        "config.json",
+        "figures",
+        "metrics.jsonl",
+        "summary.json",
         "timing.jsonl",
-    }  # fmt: skip
+    }
     assert (run / "figures" / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
     again = sauna("train", WORLD, "--out", str(run), cwd=tmp_path)
     assert again.returncode == 2 and f"sauna resume {run}" in again.stderr
@@ -144,9 +138,14 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     "what, word",
-    [("envs", "HalfCheetah-v5"), ("arms", "sauna-paper"), ("presets", "mujoco-release"),
-     ("filters", "random-drop"), ("targets", "minibatch")],
-)  # fmt: skip
+    [
+        ("envs", "HalfCheetah-v5"),
+        ("arms", "sauna-paper"),
+        ("presets", "mujoco-release"),
+        ("filters", "random-drop"),
+        ("targets", "minibatch"),
+    ],
+)
 def test_lists(what: str, word: str, capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["list", what])
     assert word in capsys.readouterr().out
@@ -227,12 +226,27 @@ def test_values_that_cannot_be_read(name, text) -> None:
 def test_presets_are_the_published_numbers() -> None:
     config = resolve({"env": "x", "arm": "ppo"})
     published = {
-        "rollout_steps": 2048, "envs": 1, "minibatches": 32, "epochs": 10, "learning_rate": 3e-4,
-        "learning_rate_schedule": "linear", "clip_range": 0.2, "entropy_coef": 0.0,
-        "value_coef": 0.5, "gamma": 0.99, "gae_lambda": 0.95, "hidden": (64, 64),
-        "activation": "tanh", "trunk": "separate", "adam_epsilon": 1e-5, "max_grad_norm": 0.5,
-        "clip_observations": 10.0, "clip_rewards": 10.0, "log_std_init": 0.0, "clip_value": True,
-    }  # fmt: skip
+        "rollout_steps": 2048,
+        "envs": 1,
+        "minibatches": 32,
+        "epochs": 10,
+        "learning_rate": 3e-4,
+        "learning_rate_schedule": "linear",
+        "clip_range": 0.2,
+        "entropy_coef": 0.0,
+        "value_coef": 0.5,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "hidden": (64, 64),
+        "activation": "tanh",
+        "trunk": "separate",
+        "adam_epsilon": 1e-5,
+        "max_grad_norm": 0.5,
+        "clip_observations": 10.0,
+        "clip_rewards": 10.0,
+        "log_std_init": 0.0,
+        "clip_value": True,
+    }
     assert {name: getattr(config, name) for name in published} == published
     release = resolve({"env": "x", "arm": "ppo", "preset": "mujoco-release"})
     changed = {n for n in FIELDS if getattr(release, n) != getattr(config, n)}
@@ -245,20 +259,43 @@ def test_presets_are_the_published_numbers() -> None:
     assert flagrun.rollout_steps * flagrun.envs // flagrun.minibatches == 4096
     atari = resolve({"env": "x", "arm": "ppo", "preset": "atari"})
     published = {
-        "rollout_steps": 128, "envs": 8, "minibatches": 4, "epochs": 3, "learning_rate": 2.5e-4,
-        "learning_rate_schedule": "linear", "clip_range": 0.1, "entropy_coef": 0.01,
-        "value_coef": 1.0, "gamma": 0.99, "gae_lambda": 0.95, "trunk": "shared",
-        "sign_rewards": True, "normalize_rewards": False, "clip_value": True,
-    }  # fmt: skip
+        "rollout_steps": 128,
+        "envs": 8,
+        "minibatches": 4,
+        "epochs": 3,
+        "learning_rate": 2.5e-4,
+        "learning_rate_schedule": "linear",
+        "clip_range": 0.1,
+        "entropy_coef": 0.01,
+        "value_coef": 1.0,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "trunk": "shared",
+        "sign_rewards": True,
+        "normalize_rewards": False,
+        "clip_value": True,
+    }
     assert {name: getattr(atari, name) for name in published} == published
     minatar = resolve({"env": "x", "arm": "ppo", "preset": "minatar"})
     published = {
-        "rollout_steps": 128, "envs": 64, "minibatches": 8, "epochs": 4, "learning_rate": 5e-3,
-        "learning_rate_schedule": "linear", "clip_range": 0.2, "entropy_coef": 0.01,
-        "value_coef": 0.5, "gamma": 0.99, "gae_lambda": 0.95, "hidden": (64, 64),
-        "activation": "relu", "trunk": "separate", "normalize_observations": False,
-        "normalize_rewards": False, "sign_rewards": False,
-    }  # fmt: skip
+        "rollout_steps": 128,
+        "envs": 64,
+        "minibatches": 8,
+        "epochs": 4,
+        "learning_rate": 5e-3,
+        "learning_rate_schedule": "linear",
+        "clip_range": 0.2,
+        "entropy_coef": 0.01,
+        "value_coef": 0.5,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "hidden": (64, 64),
+        "activation": "relu",
+        "trunk": "separate",
+        "normalize_observations": False,
+        "normalize_rewards": False,
+        "sign_rewards": False,
+    }
     assert {name: getattr(minatar, name) for name in published} == published
     assert set(PRESETS) == {
         "mujoco",
@@ -276,8 +313,17 @@ def test_arms_are_the_options_table() -> None:
     def options(arm: str) -> tuple:
         given = {"env": "x", "arm": arm, **({"drop_rate": 0.1} if arm == "random-drop" else {})}
         c = members(resolve(given), given)[0].config
-        return (c.filter, c.vex_coef, c.vex_target, c.history, c.decision, c.dropped, c.gae_over,
-                c.truncation, c.budget)  # fmt: skip
+        return (
+            c.filter,
+            c.vex_coef,
+            c.vex_target,
+            c.history,
+            c.decision,
+            c.dropped,
+            c.gae_over,
+            c.truncation,
+            c.budget,
+        )
 
     corrected = ("all", "env", "replace", "all", "bootstrap", "env")
     assert options("ppo") == ("none", 0.0, "sample", *corrected)
@@ -297,19 +343,42 @@ def test_random_drop_repeats_the_rates_of_a_run(tmp_path) -> None:
     flags = small_flags(seeds=2, steps=3000)
     threshold = ["--threshold", "0.9", "--arm", "ppo,sauna"]
     assert sauna("train", WORLD, "--out", str(source), *flags, *threshold).returncode == 0
-    done = sauna("train", WORLD, "--out", str(control), *flags, "--arm", "random-drop",
-                 "--drop-rate-from", str(source))  # fmt: skip
+    done = sauna(
+        "train",
+        WORLD,
+        "--out",
+        str(control),
+        *flags,
+        "--arm",
+        "random-drop",
+        "--drop-rate-from",
+        str(source),
+    )
     assert done.returncode == 0, done.stderr
     for seed in (0, 1):
         rates = [
-            np.mean([row["keep_rate"] for row in run_directory.rows(run)
-                     if row["seed"] == seed and row["arm"] != "ppo"])
+            np.mean(
+                [
+                    row["keep_rate"]
+                    for row in run_directory.rows(run)
+                    if row["seed"] == seed and row["arm"] != "ppo"
+                ]
+            )
             for run in (source, control)
-        ]  # fmt: skip
+        ]
         assert rates[0] < 0.9 and abs(rates[0] - rates[1]) < 0.05
     stored = run_directory.read_config(control)["drop_rates"]
     assert len(stored) == 2 and all(0 < rate < 1 for rates in stored for rate in rates[1:])
-    done = sauna("train", WORLD, "--out", str(tmp_path / "x"), *small_flags(seeds="5,"), "--arm",
-                 "random-drop", "--drop-rate-from", str(source))  # fmt: skip
+    done = sauna(
+        "train",
+        WORLD,
+        "--out",
+        str(tmp_path / "x"),
+        *small_flags(seeds="5,"),
+        "--arm",
+        "random-drop",
+        "--drop-rate-from",
+        str(source),
+    )
     assert done.returncode == 2 and "has no rows of seed 5" in done.stderr
     assert not (tmp_path / "x").exists()

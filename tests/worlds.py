@@ -239,8 +239,11 @@ class Poisoned(Scripted):
 
     def observe(self) -> np.ndarray:
         seen = super().observe()
-        when = {"first": self.t == 0, "observation": self.t == self.bad[1],
-                "final": self.t >= self.end}  # fmt: skip
+        when = {
+            "first": self.t == 0,
+            "observation": self.t == self.bad[1],
+            "final": self.t >= self.end,
+        }
         if self.episodes == self.bad[0] and when.get(self.field):
             seen[self.component] = self.value
         return seen

@@ -15,8 +15,21 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-__all__ = ["BadInput", "Filter", "JaxEnv", "Result", "SaunaError", "Transition", "VexTarget",
-           "compare", "evaluate", "inspect", "load", "resume", "train"]  # fmt: skip
+__all__ = [
+    "BadInput",
+    "Filter",
+    "JaxEnv",
+    "Result",
+    "SaunaError",
+    "Transition",
+    "VexTarget",
+    "compare",
+    "evaluate",
+    "inspect",
+    "load",
+    "resume",
+    "train",
+]
 
 _HOMES = {
     "BadInput": "sauna.system.errors",

@@ -28,8 +28,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="sauna", description=__doc__.splitlines()[0] if __doc__ else None,
-                     allow_abbrev=False)  # fmt: skip
+    parser = _Parser(
+        prog="sauna", description=__doc__.splitlines()[0] if __doc__ else None, allow_abbrev=False
+    )
     parser.add_argument("--version", action="version", version=f"sauna {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
 
@@ -46,8 +47,9 @@ def make_parser() -> argparse.ArgumentParser:
 
     _add_fields(resume, list(RESUMABLE))
 
-    evaluate = commands.add_parser("eval", help="play episodes with a trained run",
-                                   allow_abbrev=False)  # fmt: skip
+    evaluate = commands.add_parser(
+        "eval", help="play episodes with a trained run", allow_abbrev=False
+    )
     evaluate.add_argument("run", metavar="RUN", help="run directory")
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
@@ -78,12 +80,14 @@ def make_parser() -> argparse.ArgumentParser:
     compare.add_argument("--arms", default=arms, help=text)
     _add_fields(compare, [n for n in FIELDS if n not in (*DECIDED, "arm")])
 
-    study = commands.add_parser("study", help="run a study of the paper's, or your own",
-                                allow_abbrev=False)  # fmt: skip
+    study = commands.add_parser(
+        "study", help="run a study of the paper's, or your own", allow_abbrev=False
+    )
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
     for command in (compare, study):
-        command.add_argument("--out", default="runs", metavar="DIR",
-                             help="where runs and results go (default runs)")  # fmt: skip
+        command.add_argument(
+            "--out", default="runs", metavar="DIR", help="where runs and results go (default runs)"
+        )
         text = "trainings at a time (default: one per core)"
         command.add_argument("--processes", default="0", metavar="N", help=text)
         text = "where to train: this machine, or a Ray cluster (default local)"
@@ -93,8 +97,9 @@ def make_parser() -> argparse.ArgumentParser:
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
-    bench.add_argument("env", nargs="?", metavar="ENV", default="HalfCheetah-v5",
-                       help="default: HalfCheetah-v5")  # fmt: skip
+    bench.add_argument(
+        "env", nargs="?", metavar="ENV", default="HalfCheetah-v5", help="default: HalfCheetah-v5"
+    )
     bench.add_argument(
         "--against", metavar="PEER", help="also run another trainer: sb3, cleanrl, brax"
     )
@@ -160,8 +165,11 @@ def _run(arguments: list[str]) -> None:
     parser = make_parser()
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
-        flags = [option for action in _subparser(parser, parsed.command)._actions
-                 for option in action.option_strings]  # fmt: skip
+        flags = [
+            option
+            for action in _subparser(parser, parsed.command)._actions
+            for option in action.option_strings
+        ]
         raise BadInput(f"unknown argument {unknown[0]!r}{nearest(unknown[0].split('=')[0], flags)}")
     values = {name: value for name, value in vars(parsed).items() if name != "command"}
     if parsed.command is None:
@@ -227,13 +235,17 @@ def _eval(values: dict[str, Any]) -> None:
     if values["video"]:
         choose_renderer()
     result = evaluate(run, **values)
-    print(f"{result['env']}, {result['mode']} actions, frozen normaliser, "
-          f"checkpoint of iteration {result['iteration']}")  # fmt: skip
+    print(
+        f"{result['env']}, {result['mode']} actions, frozen normaliser, "
+        f"checkpoint of iteration {result['iteration']}"
+    )
     for name, row in result["members"].items():
-        print(f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
-              f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
-              f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
-              f"{row['episodes']} episodes")  # fmt: skip
+        print(
+            f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
+            f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
+            f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
+            f"{row['episodes']} episodes"
+        )
     if "video" in result:
         print(f"video: {result['video']}")
 
@@ -284,8 +296,9 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
     if number := summary.get("not_measured"):
         log = Path(out) / spec.name / spec.measure / "stderr.txt"
-        raise SaunaError(f"{number} members are not measured; what is said above, and {log}, say "
-                         f"why")  # fmt: skip
+        raise SaunaError(
+            f"{number} members are not measured; what is said above, and {log}, say why"
+        )
 
 
 def _bench(values: dict[str, Any]) -> None:
@@ -315,14 +328,21 @@ def _bench(values: dict[str, Any]) -> None:
     if native and values["scale"]:
         result = scale_on_device(given, rounds, iterations, _say)
     elif native:
-        result = bench_on_device(given, rounds=rounds, iterations=iterations, against=against,
-                                 say=_say)  # fmt: skip
+        result = bench_on_device(
+            given, rounds=rounds, iterations=iterations, against=against, say=_say
+        )
         print("\n".join(report_on_device(result)))
     elif values["scale"]:
         result = bench_scale(given, rounds, _say)
     else:
-        result = bench(given, rounds=rounds, iterations=iterations, against=against,
-                       script=Path(script) if script else None, say=_say)  # fmt: skip
+        result = bench(
+            given,
+            rounds=rounds,
+            iterations=iterations,
+            against=against,
+            script=Path(script) if script else None,
+            say=_say,
+        )
         print("\n".join(report(result)))
     if file:
         Path(file).write_text(json.dumps(result, indent=1) + "\n")
@@ -360,8 +380,12 @@ def _list(values: dict[str, Any]) -> None:
         for name, text in built_in().items():
             print(f"{name:10} {text.splitlines()[0].removeprefix('# ')}")
     else:
-        known = {"arms": ARM_HELP, "presets": PRESET_HELP,
-                 "filters": FILTER_HELP, "targets": TARGET_HELP}[what]  # fmt: skip
+        known = {
+            "arms": ARM_HELP,
+            "presets": PRESET_HELP,
+            "filters": FILTER_HELP,
+            "targets": TARGET_HELP,
+        }[what]
         width = max(map(len, known))
         for name, text in known.items():
             print(f"{name:{width}}  {text}")
@@ -390,5 +414,13 @@ TARGET_HELP = dict(
         strict=True,
     )
 )
-_COMMANDS = {"train": _train, "resume": _resume, "eval": _eval, "inspect": _inspect,
-             "compare": _compare, "study": _study, "bench": _bench, "list": _list}  # fmt: skip
+_COMMANDS = {
+    "train": _train,
+    "resume": _resume,
+    "eval": _eval,
+    "inspect": _inspect,
+    "compare": _compare,
+    "study": _study,
+    "bench": _bench,
+    "list": _list,
+}

@@ -87,10 +87,15 @@ def store(row: int, found: dict[str, Any]) -> None:
 def table(rows: dict[str, dict[str, Any]]) -> list[str]:
     head = ("row", "tried", "lost", "silent", "worst time")
     lines = [head] + [
-        (f"{int(number)} {row['row']}", f"{row['tried']:,}", str(row["lost"]), str(row["silent"]),
-         f"{row['worst']:.3g} s")
+        (
+            f"{int(number)} {row['row']}",
+            f"{row['tried']:,}",
+            str(row["lost"]),
+            str(row["silent"]),
+            f"{row['worst']:.3g} s",
+        )
         for number, row in rows.items()
-    ]  # fmt: skip
+    ]
     return ["| " + " | ".join(line) + " |" for line in [head, ("---",) * 5, *lines[1:]]]
 
 

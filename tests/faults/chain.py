@@ -13,8 +13,17 @@ from faults.nursery import Nursery, Process, Started
 from faults.result import Tally
 from sauna.system import checkpoint, run_directory
 
-SETTINGS = {"rollout-steps": 32, "minibatches": 4, "epochs": 2, "hidden": "8,8", "seeds": 2,
-            "arm": "sauna", "threshold": 0.9, "checkpoint-every": 2, "processes": 1}  # fmt: skip
+SETTINGS = {
+    "rollout-steps": 32,
+    "minibatches": 4,
+    "epochs": 2,
+    "hidden": "8,8",
+    "seeds": 2,
+    "arm": "sauna",
+    "threshold": 0.9,
+    "checkpoint-every": 2,
+    "processes": 1,
+}
 # Where a run's environments are stepped: the environment, and what else differs.
 BACKENDS: dict[str, tuple[str, dict[str, object]]] = {
     "host": ("worlds:Scripted", {}),

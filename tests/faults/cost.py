@@ -25,8 +25,14 @@ RESULTS = ROOT / "results" / "checks.json"
 HOST = {"env": "HalfCheetah-v5", "arm": "ppo", "steps": 1_000_000}
 MEMBERS = (1, 3)
 ROUNDS = 5
-DEVICE = {"env": "gymnax/CartPole-v1", "arm": "ppo", "envs": 16, "rollout_steps": 128,
-          "minibatches": 32, "steps": 10_000_000}  # fmt: skip
+DEVICE = {
+    "env": "gymnax/CartPole-v1",
+    "arm": "ppo",
+    "envs": 16,
+    "rollout_steps": 128,
+    "minibatches": 32,
+    "steps": 10_000_000,
+}
 # What `helpers.make_job` would make small otherwise.
 PRESET = {"minibatches": 32, "epochs": 10, "hidden": "64,64", "rollout_steps": 2048}
 TURNS = 300
@@ -60,6 +66,7 @@ def of_the_update() -> float:
     import jax
 
     from helpers import make_job
+    from sauna.algorithm.learner.program import make_learner
     from sauna.algorithm.learner.update import minibatch_order
     from sauna.algorithm.rollout.host import HostCollector
     from sauna.algorithm.rollout.program import make_program
@@ -76,15 +83,16 @@ def of_the_update() -> float:
         envs = make_envs(job)
         collector = HostCollector(program, job.spaces, envs, [key])
         collector.start()
-        state = program.init(key.init)
+        learner = make_learner(job.config, program.policy)
+        state = learner.init(key.init)
         limit = np.array([job.config.rollout_steps])
         (told,) = collector.collect(np.asarray(state.params)[None], [hypers], 0, limit)
         envs.close()
-        batch = program.make_batch(told.rollout, hypers)
+        batch = learner.make_batch(told.rollout, hypers)
 
         def call() -> None:
             nonlocal state  # used up by each call
-            state, metrics = program.learn(state, told.rollout, batch, hypers, order)
+            state, metrics = learner.learn(state, told.rollout, batch, hypers, order)
             jax.block_until_ready(metrics)
 
         call()

@@ -65,9 +65,16 @@ def watched(folder: Path, hook: Hook) -> Iterator[None]:
         return _File(plain_open(path, mode, *more, **named), name, hook)
 
     plain_open = io.open
-    kinds = {"mkdir": "mkdir", "rename": "rename", "replace": "rename", "unlink": "unlink",
-             "remove": "unlink", "rmdir": "rmdir", "truncate": "truncate",
-             "fsync": "fsync"}  # fmt: skip
+    kinds = {
+        "mkdir": "mkdir",
+        "rename": "rename",
+        "replace": "rename",
+        "unlink": "unlink",
+        "remove": "unlink",
+        "rmdir": "rmdir",
+        "truncate": "truncate",
+        "fsync": "fsync",
+    }
     changed = {name: around(kind, getattr(os, name)) for name, kind in kinds.items()}
     with patch.multiple(os, **changed), patch("io.open", opened):
         yield

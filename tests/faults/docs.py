@@ -12,8 +12,12 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 def write(page: Path, stored: dict[str, Any]) -> None:
     """Puts what was measured between the page's markers; what was not says so."""
     text = page.read_text()
-    for name, lines in (("campaign", _campaign(stored)), ("mutants", _mutants()),
-                        ("soak", _soak()), ("checks", _checks())):  # fmt: skip
+    for name, lines in (
+        ("campaign", _campaign(stored)),
+        ("mutants", _mutants()),
+        ("soak", _soak()),
+        ("checks", _checks()),
+    ):
         begin, end = f"<!-- {name} begin -->\n", f"<!-- {name} end -->"
         head, _, rest = text.partition(begin)
         text = head + begin + "\n".join(lines) + "\n" + end + rest.partition(end)[2]
@@ -24,14 +28,21 @@ def _campaign(stored: dict[str, Any]) -> list[str]:
     lines = ["| row | tried | lost | silent | worst time | of that |", "|---|---|---|---|---|---|"]
     for number, row in stored["rows"].items():
         notes = ", ".join(f"{name} {value:,}" for name, value in row["notes"].items())
-        lines.append(f"| {int(number)} {row['row']} | {row['tried']:,} | {row['lost']} | "
-                     f"{row['silent']} | {row['worst']:.3g} s | {notes} |")  # fmt: skip
-    machines = {f"{row['machine']['processor']}, {row['machine']['cores']} cores"
-                for row in stored["rows"].values()}  # fmt: skip
+        lines.append(
+            f"| {int(number)} {row['row']} | {row['tried']:,} | {row['lost']} | "
+            f"{row['silent']} | {row['worst']:.3g} s | {notes} |"
+        )
+    machines = {
+        f"{row['machine']['processor']}, {row['machine']['cores']} cores"
+        for row in stored["rows"].values()
+    }
     sources = {row["sources"] for row in stored["rows"].values()}
-    lines += ["", f"Measured on: {'; '.join(sorted(machines))}. Each row was measured with the "
-              f"package as it was then ({len(sources)} states of it; `results/reliability.json` "
-              f"names each row's)."]  # fmt: skip
+    lines += [
+        "",
+        f"Measured on: {'; '.join(sorted(machines))}. Each row was measured with the "
+        f"package as it was then ({len(sources)} states of it; `results/reliability.json` "
+        f"names each row's).",
+    ]
     return lines
 
 
@@ -45,8 +56,10 @@ def _mutants() -> list[str]:
     if found is None:
         return ["Not measured yet."]
     rest = found["mutants"] - found["equivalent"]
-    lines = [f"{found['caught']} of {rest} are caught ({found['share']:.1%}); "
-             f"{found['equivalent']} more make the same program."]  # fmt: skip
+    lines = [
+        f"{found['caught']} of {rest} are caught ({found['share']:.1%}); "
+        f"{found['equivalent']} more make the same program."
+    ]
     for row in found["rows"]:
         if row["caught_by"] is None:
             why = row["equivalent"] or "not caught"
@@ -58,9 +71,12 @@ def _soak() -> list[str]:
     found = _load("soak")
     if found is None:
         return ["Not measured yet."]
-    lines = [f"`{found['command']}`, {found['hours']:.2f} hours, {found['env_steps']:,} env steps.",
-             "", "| of all its processes | mean | largest | change per hour (95%) |",
-             "|---|---|---|---|"]  # fmt: skip
+    lines = [
+        f"`{found['command']}`, {found['hours']:.2f} hours, {found['env_steps']:,} env steps.",
+        "",
+        "| of all its processes | mean | largest | change per hour (95%) |",
+        "|---|---|---|---|",
+    ]
     units = {"memory": "MiB of memory", "files": "open files", "threads": "threads"}
     for name, row in found["slopes"].items():
         change = f"{row['per_hour']:+.2f} ({row['low']:+.2f} to {row['high']:+.2f})"
@@ -73,12 +89,19 @@ def _checks() -> list[str]:
     if found is None:
         return ["Not measured yet."]
     host, device = found["host"], found["device"]
-    lines = [f"Shares of the time of a training ({host['env']}, one process):", "",
-             "| seeds | finite checks | logging | checkpoints, with their hashing | all |",
-             "|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        f"Shares of the time of a training ({host['env']}, one process):",
+        "",
+        "| seeds | finite checks | logging | checkpoints, with their hashing | all |",
+        "|---|---|---|---|---|",
+    ]
     for members, part in host["members"].items():
         shares = (f"{part[name]:.2%}" for name in ("checks", "logging", "checkpoints", "all"))
         lines.append(f"| {members} | {' | '.join(shares)} |")
-    return [*lines, "", f"Compiled in: {max(found['update'], 0.0):.2%} of an update, and "
-            f"{max(device['share'], 0.0):.2%} of an iteration on the device ({device['env']}, "
-            f"{device['envs']} environments)."]  # fmt: skip
+    return [
+        *lines,
+        "",
+        f"Compiled in: {max(found['update'], 0.0):.2%} of an update, and "
+        f"{max(device['share'], 0.0):.2%} of an iteration on the device ({device['env']}, "
+        f"{device['envs']} environments).",
+    ]

@@ -36,10 +36,17 @@ def forge(run: Path, blob: bytes | None = None, raw: bytes | None = None, **chan
     (run / "config.json").write_text("{}")
     blob = good_blob() if blob is None else blob
     (place / "state.safetensors").write_bytes(blob)
-    manifest = {"format": FORMAT, "iteration": int(NUMBER), "bytes": len(blob),
-                "sha256": hashlib.sha256(blob).hexdigest(), "config": {}, "members": ["ppo/0"],
-                "spaces": ["vector", [3], "continuous", [2], "", ""], "logs": {},
-                **changes}  # fmt: skip
+    manifest = {
+        "format": FORMAT,
+        "iteration": int(NUMBER),
+        "bytes": len(blob),
+        "sha256": hashlib.sha256(blob).hexdigest(),
+        "config": {},
+        "members": ["ppo/0"],
+        "spaces": ["vector", [3], "continuous", [2], "", ""],
+        "logs": {},
+        **changes,
+    }
     manifest["manifest_sha256"] = _digest(manifest)
     text = json.dumps(manifest).encode() if raw is None else raw
     (place / "manifest.json").write_bytes(text)
@@ -169,7 +176,7 @@ def manifests() -> dict[str, dict[str, Any]]:
         "environment builtins:exec": {"config": {"env": "builtins:exec"}},
         "environment pickle:loads": {"config": {"env": "pickle:loads"}},
         "environment in a package of Python": {"config": {"env": "multiprocessing.util:spawnv"}},
-    }  # fmt: skip
+    }
 
 
 def _replace(run: Path, name: str, make: Callable[[Path], object]) -> None:

@@ -29,8 +29,13 @@ SOURCE = TESTS.parent / "src"
 
 def environment() -> dict[str, str]:
     path = os.pathsep.join([str(SOURCE), str(TESTS)])
-    return {**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "PJRT_NPROC": "1",
-            "OMP_NUM_THREADS": "1"}  # fmt: skip
+    return {
+        **os.environ,
+        "PYTHONPATH": path,
+        "JAX_PLATFORMS": "cpu",
+        "PJRT_NPROC": "1",
+        "OMP_NUM_THREADS": "1",
+    }
 
 
 class Process:
@@ -59,9 +64,12 @@ class Started(Process):
         super().__init__(log)
         with log.open("w") as out:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "sauna", *arguments], stdout=out, stderr=out,
-                env=environment(), start_new_session=True,
-            )  # fmt: skip
+                [sys.executable, "-m", "sauna", *arguments],
+                stdout=out,
+                stderr=out,
+                env=environment(),
+                start_new_session=True,
+            )
         self.pid = self._process.pid
 
     def wait(self, seconds: float) -> int | None:
@@ -89,12 +97,16 @@ class Nursery:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "faults.nursery"], stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, text=True, env=environment(),
-        )  # fmt: skip
+            [sys.executable, "-m", "faults.nursery"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment(),
+        )
 
-    def start(self, arguments: list[str], log: Path, at: float = 0.0, silence: float = 300.0
-              ) -> Process:  # fmt: skip
+    def start(
+        self, arguments: list[str], log: Path, at: float = 0.0, silence: float = 300.0
+    ) -> Process:
         """Starts `sauna ARGUMENTS`; not before `time.monotonic()` is `at`.
 
         `silence` stands in for `watchdog.SILENCE`.

@@ -73,8 +73,13 @@ def slope(hours: np.ndarray, values: np.ndarray) -> dict[str, float]:
         fit = scipy.stats.linregress(x, y)
         change = float(fit.slope)
         half = float(scipy.stats.t.isf(0.025, BLOCKS - 2)) * float(fit.stderr)
-    return {"mean": float(values.mean()), "largest": float(values.max()),
-            "per_hour": change, "low": change - half, "high": change + half}  # fmt: skip
+    return {
+        "mean": float(values.mean()),
+        "largest": float(values.max()),
+        "per_hour": change,
+        "low": change - half,
+        "high": change + half,
+    }
 
 
 def watch(command: list[str], minutes: float) -> tuple[list[dict[str, float]], int]:
@@ -133,8 +138,11 @@ def main() -> int:
         "machine": run_directory.machine(),
         "versions": run_directory.versions(),
     }
-    print(json.dumps({key: found[key] for key in ("hours", "exit_code", "env_steps", "slopes")},
-                     indent=1))  # fmt: skip
+    print(
+        json.dumps(
+            {key: found[key] for key in ("hours", "exit_code", "env_steps", "slopes")}, indent=1
+        )
+    )
     if not given.trial:
         RESULTS.write_text(json.dumps(found, indent=1) + "\n")
     return 0 if code == 128 + signal.SIGTERM else 1

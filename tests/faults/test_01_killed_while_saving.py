@@ -65,9 +65,13 @@ def over_a_bad_one(folder: Path) -> tuple[int, int | None]:
 
 
 SCENARIOS: list[Scenario] = [
-    first_one, one_to_prune, only_the_newest_is_kept, several_to_prune, left_over_from_a_kill,
+    first_one,
+    one_to_prune,
+    only_the_newest_is_kept,
+    several_to_prune,
+    left_over_from_a_kill,
     over_a_bad_one,
-]  # fmt: skip
+]
 
 
 def recorded(scenario: Scenario, run: Path) -> tuple[Tree, list[Op], int | None]:

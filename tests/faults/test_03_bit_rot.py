@@ -20,8 +20,11 @@ def _save_two(folder: Path, world: str) -> dict[int, dict[str, np.ndarray]]:
     """Two checkpoints of a real training."""
     states = record(world).states
     for iteration in (OLD, NEW):
-        manifest = {"config": {"gamma": 0.99, "adam_epsilon": 1e-5}, "members": ["ppo/0"],
-                    "logs": {"metrics.jsonl": 100 * iteration}}  # fmt: skip
+        manifest = {
+            "config": {"gamma": 0.99, "adam_epsilon": 1e-5},
+            "members": ["ppo/0"],
+            "logs": {"metrics.jsonl": 100 * iteration},
+        }
         checkpoint.save_checkpoint(folder, iteration, states[iteration], manifest, 2)
     return states
 

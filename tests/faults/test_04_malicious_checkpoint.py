@@ -17,9 +17,25 @@ MEMORY = 2**28  # bytes that a load may take beyond what the process has
 SECONDS = 1.0  # of CPU
 HUNG = 20.0  # by the clock, which other programs move, too
 # What a load never does; opening files is judged by their place.
-FORBIDDEN = ("exec", "compile", "import", "pickle.", "marshal.", "os.system", "os.exec", "os.fork",
-             "os.posix_spawn", "os.spawn", "subprocess.", "socket.", "ctypes.", "os.remove",
-             "os.rename", "os.mkdir", "shutil.")  # fmt: skip
+FORBIDDEN = (
+    "exec",
+    "compile",
+    "import",
+    "pickle.",
+    "marshal.",
+    "os.system",
+    "os.exec",
+    "os.fork",
+    "os.posix_spawn",
+    "os.spawn",
+    "subprocess.",
+    "socket.",
+    "ctypes.",
+    "os.remove",
+    "os.rename",
+    "os.mkdir",
+    "shutil.",
+)
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
@@ -31,8 +47,11 @@ def experiment(least: int, seed: int, place: Path) -> Result:
     hostile.forge(place / "good")
     done = subprocess.run(
         [sys.executable, "-m", "faults.test_04_malicious_checkpoint", str(place), str(len(cases))],
-        capture_output=True, text=True, env=environment(), timeout=300,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        env=environment(),
+        timeout=300,
+    )
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(lines) == len(cases) + 1, done.stderr[-2000:]
     assert lines.pop()["error"] is None, "the harmless one was refused"
@@ -118,9 +137,18 @@ def main() -> None:
             error = repr(found)
         inside.clear()
         peak = (_resident("VmHWM") - before) // 1024
-        print(json.dumps({"error": error, "refused": refused, "events": list(events),
-                          "seconds": time.process_time() - clock,
-                          "waited": time.monotonic() - start, "MiB": peak}))  # fmt: skip
+        print(
+            json.dumps(
+                {
+                    "error": error,
+                    "refused": refused,
+                    "events": list(events),
+                    "seconds": time.process_time() - clock,
+                    "waited": time.monotonic() - start,
+                    "MiB": peak,
+                }
+            )
+        )
 
 
 if __name__ == "__main__":

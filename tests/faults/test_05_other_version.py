@@ -24,9 +24,17 @@ from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 
 # A value of the same type that is another one, where adding 1 would not be.
-OTHERS = {"env_kwargs": {"speed": 2}, "arm": ["sauna"], "seeds": [7],
-          "preset": "mujoco-release", "hidden": [8, 9], "drop_rate_from": "elsewhere",
-          "gamma": 0.5, "gae_lambda": 0.5, "drop_rate": 0.25}  # fmt: skip
+OTHERS = {
+    "env_kwargs": {"speed": 2},
+    "arm": ["sauna"],
+    "seeds": [7],
+    "preset": "mujoco-release",
+    "hidden": [8, 9],
+    "drop_rate_from": "elsewhere",
+    "gamma": 0.5,
+    "gae_lambda": 0.5,
+    "drop_rate": 0.25,
+}
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:

@@ -55,8 +55,15 @@ def cases() -> list[dict[str, Any]]:
     for field, value, episode in itertools.product(FIELDS, VALUES, (1, 3)):
         for component in (0, 2) if field != "reward" else (0,):
             for step in (1, 2) if field in ("observation", "reward") else (1,):
-                found.append({"field": field, "value": value, "component": component,
-                              "episode": episode, "step": step})  # fmt: skip
+                found.append(
+                    {
+                        "field": field,
+                        "value": value,
+                        "component": component,
+                        "episode": episode,
+                        "step": step,
+                    }
+                )
     return found
 
 
@@ -115,8 +122,11 @@ def _until_refused(envs: HostEnvs, tally: Tally) -> str:
 def _check_message(message: str, kwargs: dict[str, Any], what: str, tally: Tally) -> None:
     """It names the environment, the episode, the step and the field with its value."""
     name = "reward" if kwargs["field"] == "reward" else f"observation[{kwargs['component']}]"
-    wanted = [" of seed ", f"episode {kwargs['episode'] - 1}, step ",
-              f"{name} is {kwargs['value']}"]  # fmt: skip
+    wanted = [
+        " of seed ",
+        f"episode {kwargs['episode'] - 1}, step ",
+        f"{name} is {kwargs['value']}",
+    ]
     if "got through" in message or "nothing" in message:
         tally.miss(f"{what}: {message}")
     elif not all(part in message for part in wanted):
@@ -134,7 +144,7 @@ def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
     tally.count("inside of a rollout")
     try:
         collector.start()
-        params = np.stack([np.asarray(program.init(key.init).params)])
+        params = np.stack([np.asarray(program.policy.init(key.init))])
         collector.collect(params, [hypers], 0, np.array([64]))
         tally.miss(f"{kwargs}: a rollout was filled with it")
     except EnvironmentFailure:
@@ -191,8 +201,10 @@ class OnDevice:
         tally.count("device")
         iteration, row = divmod(_row(episode, kwargs), ROLLOUT)
         what = "reward" if kwargs["field"] == "reward" else "observation"
-        wanted = (f"environment {env} of ppo/0, iteration {iteration}, step {row} of the rollout: "
-                  f"{what} is not finite")  # fmt: skip
+        wanted = (
+            f"environment {env} of ppo/0, iteration {iteration}, step {row} of the rollout: "
+            f"{what} is not finite"
+        )
         message = "it got through"
         for i in np.flatnonzero(reports.ran):
             try:
@@ -234,15 +246,27 @@ def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
     kwargs = '{"field": "reward", "value": "nan", "episode": 25}'
     wanted = r"environment 0 of seed 0, episode \d+.*reward is nan"
     with trained_here(), pytest.raises(SaunaError, match=wanted):
-        sauna.train("worlds:Poisoned", env_kwargs=kwargs, out=run, quiet=True, arm="ppo",
-                    checkpoint_every=1, **{**SMALL, "steps": 3200})  # fmt: skip
+        sauna.train(
+            "worlds:Poisoned",
+            env_kwargs=kwargs,
+            out=run,
+            quiet=True,
+            arm="ppo",
+            checkpoint_every=1,
+            **{**SMALL, "steps": 3200},
+        )
     found = checkpoint.load_newest(run / "checkpoints", print)
     assert found is not None and found.manifest["iteration"] == len(run_directory.rows(run)) > 1
     assert not run_directory.is_complete(run)
 
 
 def test_a_recorded_training_that_fails_has_reported_nothing_of_the_iteration() -> None:
-    job = make_job("worlds:Poisoned", arm="ppo", steps=3200, checkpoint_every=1,
-                   env_kwargs='{"field": "final", "value": "inf", "episode": 25}')  # fmt: skip
+    job = make_job(
+        "worlds:Poisoned",
+        arm="ppo",
+        steps=3200,
+        checkpoint_every=1,
+        env_kwargs='{"field": "final", "value": "inf", "episode": 25}',
+    )
     with pytest.raises(EnvironmentFailure, match="is inf"):
         train_here(job)

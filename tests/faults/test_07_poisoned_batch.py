@@ -15,8 +15,9 @@ import pytest
 import sauna
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, Recorder, make_job
+from sauna.algorithm.learner.program import make_learner
 from sauna.algorithm.learner.update import minibatch_order
-from sauna.algorithm.rollout.program import Program, make_program
+from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.types import Batch, Hypers, Rollout, TrainState, member_keys
 from sauna.system import checkpoint, run_directory
 from sauna.system.checkpoint import NotFinite, save_checkpoint
@@ -33,7 +34,7 @@ class _Learner:
     def __init__(self, **settings: int) -> None:
         job = make_job("worlds:Scripted", arm="sauna", **settings)
         self.config = job.config
-        self.program: Program = make_program(job.config, job.spaces)
+        self.learner = make_learner(job.config, make_policy(job.config, job.spaces))
         rng, number = np.random.default_rng(0), job.config.rollout_steps
         draw = lambda *shape: rng.normal(size=(number, *shape)).astype(np.float32)  # noqa: E731
         ones = np.ones(number, np.float32)
@@ -45,9 +46,9 @@ class _Learner:
         self.hypers = Hypers(*(np.float32(0.1) for _ in Hypers._fields))
 
     def learn(self, batch: Batch, hypers: Hypers) -> tuple[TrainState, bool]:
-        state = self.program.init(member_keys(0).init)
+        state = self.learner.init(member_keys(0).init)
         order = minibatch_order(self.config, 0, 0)
-        state, metrics = self.program.learn(state, self.rollout, batch, hypers, order)
+        state, metrics = self.learner.learn(state, self.rollout, batch, hypers, order)
         return jax.device_get(state), bool(metrics.finite)
 
 

@@ -37,12 +37,18 @@ SLACK = 4.0  # seconds more on a machine that is busy with other things
 # What an environment does, where it does it, and what has to be said of it.
 SILENT = f"did not answer within {DEADLINE:g} s"
 INSIDE = {
-    "exit": "ended with exit code 7", "abort": "ended with exit code -6",
-    "kill": "ended with exit code -9", "raise": "raised ValueError: the motor is on fire",
-    "hang": SILENT, "stop": SILENT,
-}  # fmt: skip
-OUTSIDE = {"SIGKILL": "ended with exit code -9", "SIGSEGV": "ended with exit code -11",
-           "SIGSTOP": SILENT}  # fmt: skip
+    "exit": "ended with exit code 7",
+    "abort": "ended with exit code -6",
+    "kill": "ended with exit code -9",
+    "raise": "raised ValueError: the motor is on fire",
+    "hang": SILENT,
+    "stop": SILENT,
+}
+OUTSIDE = {
+    "SIGKILL": "ended with exit code -9",
+    "SIGSEGV": "ended with exit code -11",
+    "SIGSTOP": SILENT,
+}
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
@@ -157,8 +163,11 @@ def _strike_run(chain: Chain, process: Any, what: str, rng: random.Random, tally
     code, allowed = process.wait(PATIENCE), 4.0 if what == "SIGSTOP" else 0.0
     seconds = time.monotonic() - clock
     tally.took(max(0.0, seconds - allowed))
-    wanted = {"SIGKILL": (1, f"({victim}) ended with exit code -9"), "coordinator": (-9, ""),
-              "SIGSTOP": (1, f"({victim}) gave no sign of life for 4 s")}[what]  # fmt: skip
+    wanted = {
+        "SIGKILL": (1, f"({victim}) ended with exit code -9"),
+        "coordinator": (-9, ""),
+        "SIGSTOP": (1, f"({victim}) gave no sign of life for 4 s"),
+    }[what]
     named = code == wanted[0] and wanted[1] in process.said()
     if not named and not chain.is_complete():
         tally.miss(f"training process, {what}: {code}, {process.said()[-300:]!r}")
@@ -189,8 +198,15 @@ def test_a_dead_worker_is_noticed_while_another_one_is_awaited() -> None:
         strikes.append(time.monotonic())
         os.kill(pid, signal.SIGKILL)
 
-    _until_named(envs, "SIGKILL while waiting", OUTSIDE["SIGKILL"], tally, strike, strikes,
-                 f"worker 1 (process {pid})")  # fmt: skip
+    _until_named(
+        envs,
+        "SIGKILL while waiting",
+        OUTSIDE["SIGKILL"],
+        tally,
+        strike,
+        strikes,
+        f"worker 1 (process {pid})",
+    )
     assert_held(tally.result(), 1)
 
 
@@ -208,8 +224,9 @@ def test_an_environment_worker_that_hangs_dies_with_its_parent(tmp_path: Path) -
         "envs.reset(); print(envs._workers[0].process.pid, flush=True)\n"
         "envs.step(np.zeros((3, 2), np.float32), np.ones(3, bool))"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True,
-                              env=environment())  # fmt: skip
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment()
+    )
     assert parent.stdout is not None
     pid = int(parent.stdout.readline())
     time.sleep(0.3)

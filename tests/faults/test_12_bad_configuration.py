@@ -58,8 +58,13 @@ def wrong_flag(rng: random.Random) -> Mistake:
 
 
 def out_of_bounds(rng: random.Random) -> Mistake:
-    names = [n for n, f in FIELDS.items() if f.metadata["at_least"] is not None
-             or f.metadata["above"] is not None or f.metadata["at_most"] is not None]  # fmt: skip
+    names = [
+        n
+        for n, f in FIELDS.items()
+        if f.metadata["at_least"] is not None
+        or f.metadata["above"] is not None
+        or f.metadata["at_most"] is not None
+    ]
     name = rng.choice(names)
     meta = FIELDS[name].metadata
     values = ["nan", "inf", "-inf"] if TYPES[name] is float else []
@@ -76,8 +81,9 @@ def unreadable(rng: random.Random) -> Mistake:
     texts = {int: ["1.5", "ten", "", "1e", "0x10", "--"], float: ["", "a", "1,5", "1e", "-"]}
     names = [n for n in FIELDS if TYPES[n] in texts and n != "env"]
     name = rng.choice(names)
-    return Mistake(["train", WORLD, f"{flag(name)}={rng.choice(texts[TYPES[name]])}"],
-                   f"{name}: cannot read")  # fmt: skip
+    return Mistake(
+        ["train", WORLD, f"{flag(name)}={rng.choice(texts[TYPES[name]])}"], f"{name}: cannot read"
+    )
 
 
 def unknown_choice(rng: random.Random) -> Mistake:
@@ -86,8 +92,9 @@ def unknown_choice(rng: random.Random) -> Mistake:
     word = rng.choice([c for c in FIELDS[name].metadata["choices"] if len(c) > 2])
     wrong = word + rng.choice(["x", "s", "_"])
     arm = "sauna" if name != "backend" else "ppo"
-    return Mistake(["train", WORLD, "--arm", arm, flag(name), wrong],
-                   f"{name}: unknown value '{wrong}'")  # fmt: skip
+    return Mistake(
+        ["train", WORLD, "--arm", arm, flag(name), wrong], f"{name}: unknown value '{wrong}'"
+    )
 
 
 def unknown_name(rng: random.Random) -> Mistake:
@@ -100,38 +107,49 @@ def unknown_name(rng: random.Random) -> Mistake:
 
 
 def unread_setting(rng: random.Random) -> Mistake:
-    name, value = rng.choice([("threshold", "0.5"), ("history", "all"), ("dropped", "mask"),
-                              ("max_env_steps_factor", "2"), ("drop_rate", "0.1"),
-                              ("env_timeout", "5")])  # fmt: skip
+    name, value = rng.choice(
+        [
+            ("threshold", "0.5"),
+            ("history", "all"),
+            ("dropped", "mask"),
+            ("max_env_steps_factor", "2"),
+            ("drop_rate", "0.1"),
+            ("env_timeout", "5"),
+        ]
+    )
     return Mistake(["train", WORLD, "--arm", "ppo", flag(name), value], f"{name}: not read by arm")
 
 
 def impossible_together(rng: random.Random) -> Mistake:
-    return rng.choice([
-        Mistake(["train", WORLD, f"--minibatches={rng.choice([33, 7, 1000])}"], "minibatches:"),
-        Mistake(["train", WORLD, f"--steps={rng.randrange(1, 2048)}"], "steps:"),
-        Mistake(["train", WORLD, "--seeds", f"{(n := rng.randrange(99))},{n}"], "seeds:"),
-        Mistake(["train", WORLD, f"--seeds={-rng.randrange(1, 99)},1"], "seeds:"),
-        Mistake(["train", WORLD, "--arm", "random-drop"], "drop_rate:"),
-        Mistake(["train", WORLD, "--gae-over", "kept"], "gae_over:"),
-        Mistake(["train", WORLD, "--arm", "sauna,random-drop", "--drop-rate", "0.1"], "arm:"),
-        Mistake(["train", WORLD, f"--env-processes={rng.randrange(2, 99)}"], "env_processes:"),
-    ])  # fmt: skip
+    return rng.choice(
+        [
+            Mistake(["train", WORLD, f"--minibatches={rng.choice([33, 7, 1000])}"], "minibatches:"),
+            Mistake(["train", WORLD, f"--steps={rng.randrange(1, 2048)}"], "steps:"),
+            Mistake(["train", WORLD, "--seeds", f"{(n := rng.randrange(99))},{n}"], "seeds:"),
+            Mistake(["train", WORLD, f"--seeds={-rng.randrange(1, 99)},1"], "seeds:"),
+            Mistake(["train", WORLD, "--arm", "random-drop"], "drop_rate:"),
+            Mistake(["train", WORLD, "--gae-over", "kept"], "gae_over:"),
+            Mistake(["train", WORLD, "--arm", "sauna,random-drop", "--drop-rate", "0.1"], "arm:"),
+            Mistake(["train", WORLD, f"--env-processes={rng.randrange(2, 99)}"], "env_processes:"),
+        ]
+    )
 
 
 def wrong_environment(rng: random.Random) -> Mistake:
     known = ["HalfCheetah-v5", "Hopper-v5", "CartPole-v1", "InvertedPendulum-v5"]
     name = rng.choice(known)
     command = rng.choice(["train", "compare", "bench"])
-    return rng.choice([
-        Mistake([command, typo(name[:-3], rng) + name[-3:]], "env: unknown environment"),
-        Mistake(["train", f"nowhere{rng.randrange(99)}:Thing"], "env: cannot import"),
-        Mistake(["train", "worlds:Scriptd"], "did you mean 'Scripted'?"),
-        Mistake(["train", WORLD, "--env-kwargs", '{"speed": 3}'], "cannot be made"),
-        Mistake(["train", WORLD, "--env-kwargs", "{speed: 3}"], "env_kwargs: cannot read"),
-        Mistake(["train", "os:system"], "'os' is a part of Python"),
-        Mistake(["train"], "no environment given"),
-    ])  # fmt: skip
+    return rng.choice(
+        [
+            Mistake([command, typo(name[:-3], rng) + name[-3:]], "env: unknown environment"),
+            Mistake(["train", f"nowhere{rng.randrange(99)}:Thing"], "env: cannot import"),
+            Mistake(["train", "worlds:Scriptd"], "did you mean 'Scripted'?"),
+            Mistake(["train", WORLD, "--env-kwargs", '{"speed": 3}'], "cannot be made"),
+            Mistake(["train", WORLD, "--env-kwargs", "{speed: 3}"], "env_kwargs: cannot read"),
+            Mistake(["train", "os:system"], "'os' is a part of Python"),
+            Mistake(["train"], "no environment given"),
+        ]
+    )
 
 
 def wrong_command(rng: random.Random) -> Mistake:
@@ -144,15 +162,17 @@ def wrong_command(rng: random.Random) -> Mistake:
 
 def wrong_run(rng: random.Random) -> Mistake:
     name = f"no-run-{rng.randrange(999)}"
-    return rng.choice([
-        Mistake(["resume", name], f"{name} is not a run directory"),
-        Mistake(["eval", name], f"{name} is not a run directory"),
-        Mistake(["resume", name, "--gamma", "0.9"], "unknown argument '--gamma'"),
-        Mistake(["eval", name, "--episodes", "0"], "episodes: must be a whole number"),
-        Mistake(["eval", name, "--seed", "x"], "seed: must be a whole number"),
-        Mistake(["resume", name, "--processes", "many"], f"{name} is not a run directory"),
-        Mistake(["train", "--config", f"{name}.json"], f"cannot read {name}.json"),
-    ])  # fmt: skip
+    return rng.choice(
+        [
+            Mistake(["resume", name], f"{name} is not a run directory"),
+            Mistake(["eval", name], f"{name} is not a run directory"),
+            Mistake(["resume", name, "--gamma", "0.9"], "unknown argument '--gamma'"),
+            Mistake(["eval", name, "--episodes", "0"], "episodes: must be a whole number"),
+            Mistake(["eval", name, "--seed", "x"], "seed: must be a whole number"),
+            Mistake(["resume", name, "--processes", "many"], f"{name} is not a run directory"),
+            Mistake(["train", "--config", f"{name}.json"], f"cannot read {name}.json"),
+        ]
+    )
 
 
 def wrong_config_file(rng: random.Random) -> Mistake:
@@ -160,45 +180,58 @@ def wrong_config_file(rng: random.Random) -> Mistake:
     wrong = name
     while wrong in FIELDS:
         wrong = typo(name, rng)
-    return rng.choice([
-        Mistake(["train", WORLD, "--config", "{file}"], f"unknown key '{wrong}'; did you mean",
-                f'{{"{wrong}": 1}}'),
-        Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", '{"gamma": 0.9'),
-        Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", "[1, 2]"),
-        Mistake(["train", WORLD, "--config", "{file}"], "twice", '{"gamma": 0.9, "gamma": 0.5}'),
-        Mistake(["train", WORLD, "--config", "{file}"], "gamma: must be", '{"gamma": 2}'),
-    ])  # fmt: skip
+    return rng.choice(
+        [
+            Mistake(
+                ["train", WORLD, "--config", "{file}"],
+                f"unknown key '{wrong}'; did you mean",
+                f'{{"{wrong}": 1}}',
+            ),
+            Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", '{"gamma": 0.9'),
+            Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", "[1, 2]"),
+            Mistake(
+                ["train", WORLD, "--config", "{file}"], "twice", '{"gamma": 0.9, "gamma": 0.5}'
+            ),
+            Mistake(["train", WORLD, "--config", "{file}"], "gamma: must be", '{"gamma": 2}'),
+        ]
+    )
 
 
 def wrong_study(rng: random.Random) -> Mistake:
     start = 'tasks = ["worlds:Scripted"]\n'
     arm = '[[arms]]\nlabel = "ppo"\n'
-    return rng.choice([
-        Mistake(["study", "fig33"], "did you mean"),
-        Mistake(["study", "{file}"], "cannot read", "tasks = ["),
-        Mistake(["study", "{file}"], "unknown key", f'task = ["x"]\n{arm}'),
-        Mistake(["study", "{file}"], "no arms", start),
-        Mistake(["study", "{file}"], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'),
-        Mistake(["study", "{file}"], "minibatches", f"minibatches = 7\n{start}{arm}"),
-        Mistake(["study", "{file}"], "gamma", f"gamma = {rng.uniform(1.1, 9):.3f}\n{start}{arm}"),
-        Mistake(["study", "{file}", "--processes", "-1"], "processes:", start + arm),
-        Mistake(["study", "{file}", "--on", "mars"], "invalid choice: 'mars'", start + arm),
-        Mistake(["compare", WORLD, "--arms", "ppo,ppo"], "twice"),
-        Mistake(["compare", WORLD, "--arms", "ppo,suana"], "did you mean 'sauna'?"),
-        Mistake(["compare", WORLD, "--gamma", "1.5"], "gamma"),
-        Mistake(["compare"], "no environment given"),
-        Mistake(["list", "arm"], "invalid choice: 'arm'"),
-        Mistake(["bench", "--rounds", "0"], "rounds: must be a whole number"),
-    ])  # fmt: skip
+    return rng.choice(
+        [
+            Mistake(["study", "fig33"], "did you mean"),
+            Mistake(["study", "{file}"], "cannot read", "tasks = ["),
+            Mistake(["study", "{file}"], "unknown key", f'task = ["x"]\n{arm}'),
+            Mistake(["study", "{file}"], "no arms", start),
+            Mistake(["study", "{file}"], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'),
+            Mistake(["study", "{file}"], "minibatches", f"minibatches = 7\n{start}{arm}"),
+            Mistake(
+                ["study", "{file}"], "gamma", f"gamma = {rng.uniform(1.1, 9):.3f}\n{start}{arm}"
+            ),
+            Mistake(["study", "{file}", "--processes", "-1"], "processes:", start + arm),
+            Mistake(["study", "{file}", "--on", "mars"], "invalid choice: 'mars'", start + arm),
+            Mistake(["compare", WORLD, "--arms", "ppo,ppo"], "twice"),
+            Mistake(["compare", WORLD, "--arms", "ppo,suana"], "did you mean 'sauna'?"),
+            Mistake(["compare", WORLD, "--gamma", "1.5"], "gamma"),
+            Mistake(["compare"], "no environment given"),
+            Mistake(["list", "arm"], "invalid choice: 'arm'"),
+            Mistake(["bench", "--rounds", "0"], "rounds: must be a whole number"),
+        ]
+    )
 
 
 def wrong_on_device(rng: random.Random) -> Mistake:
     walk, pole = "jax_worlds:walk", "gymnax/CartPole-v1"
     fault = rng.choice(["raises", "branches", "observation", "reward", "terminated", "state"])
     faulty = ["train", "jax_worlds:faulty", "--env-kwargs", f'{{"fault": "{fault}"}}']
-    said = {"raises": "cannot be played: ValueError: two lines",
-            "branches": "cannot be played: TracerBool",
-            "state": "its state has other arrays"}  # fmt: skip
+    said = {
+        "raises": "cannot be played: ValueError: two lines",
+        "branches": "cannot be played: TracerBool",
+        "state": "its state has other arrays",
+    }
     import jax_worlds
 
     del jax_worlds
@@ -232,10 +265,20 @@ def wrong_on_device(rng: random.Random) -> Mistake:
 
 
 KINDS: list[Callable[[random.Random], Mistake]] = [
-    wrong_flag, out_of_bounds, unreadable, unknown_choice, unknown_name, unread_setting,
-    impossible_together, wrong_environment, wrong_command, wrong_run, wrong_config_file,
-    wrong_study, wrong_on_device,
-]  # fmt: skip
+    wrong_flag,
+    out_of_bounds,
+    unreadable,
+    unknown_choice,
+    unknown_name,
+    unread_setting,
+    impossible_together,
+    wrong_environment,
+    wrong_command,
+    wrong_run,
+    wrong_config_file,
+    wrong_study,
+    wrong_on_device,
+]
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
@@ -288,8 +331,12 @@ def _here(arguments: list[str]) -> tuple[int, str, float]:
 
 def _in_a_process(arguments: list[str]) -> tuple[int, str, float]:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-m", "sauna", *arguments], capture_output=True,
-                          text=True, env=environment())  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "sauna", *arguments],
+        capture_output=True,
+        text=True,
+        env=environment(),
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
     return done.returncode, done.stderr, seconds

@@ -40,13 +40,22 @@ def experiment(kills: int, seed: int, place: Path) -> Result:
         + "".join(f"{key} = {json.dumps(value)}\n" for key, value in QUICK.items())
         + '[[arms]]\nlabel = "ppo"\n'
     )
-    command = [sys.executable, "-m", "sauna", "study", str(study), "--out", str(place / "out"),
-               "--processes=2"]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "sauna",
+        "study",
+        str(study),
+        "--out",
+        str(place / "out"),
+        "--processes=2",
+    ]
     for _ in range(kills):
         _kill(command, place, rng, tally)
     clock = time.monotonic()
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True,
-                          timeout=PATIENCE)  # fmt: skip
+    done = subprocess.run(
+        command, env=environment(), capture_output=True, text=True, timeout=PATIENCE
+    )
     tally.took(time.monotonic() - clock)
     if done.returncode != 0:
         tally.lose(f"the study ended with {done.returncode}: {done.stderr[-500:]}")
@@ -98,9 +107,16 @@ def _judge_cell(cell: dict[str, Any], row: dict[str, Any], reason: str, tally: T
 
 def _row(seed: int, iteration: int) -> dict[str, Any]:
     steps = 32 * (iteration + 1)
-    return {"member": f"ppo/{seed}", "arm": "ppo", "seed": seed, "iteration": iteration,
-            "env_steps": steps, "kept_steps": steps, "episodes": iteration,
-            "return_mean": float(seed + iteration)}  # fmt: skip
+    return {
+        "member": f"ppo/{seed}",
+        "arm": "ppo",
+        "seed": seed,
+        "iteration": iteration,
+        "env_steps": steps,
+        "kept_steps": steps,
+        "episodes": iteration,
+        "return_mean": float(seed + iteration),
+    }
 
 
 class _Pretended(Executor):
@@ -142,8 +158,9 @@ class _Silent:
 def test_the_other_seeds_go_on_and_no_mean_hides_the_failed_one(tmp_path: Path) -> None:
     """The product's own scheduling, splitting, gathering and table; only training is pretended."""
     arms = [{"label": "ppo"}]
-    spec = read_spec({"name": "unlucky", "tasks": ["worlds:Unlucky"], "seeds": SEEDS,
-                      "arms": arms, **QUICK})  # fmt: skip
+    spec = read_spec(
+        {"name": "unlucky", "tasks": ["worlds:Unlucky"], "seeds": SEEDS, "arms": arms, **QUICK}
+    )
     units, folder = units_of(spec, 3), tmp_path / "units"
     tally, place = Tally(), tmp_path / "unlucky"
     place.mkdir()

@@ -74,5 +74,6 @@ def _json_object(value: Any) -> str:
     try:
         return json.dumps(parsed, sort_keys=True, allow_nan=False)
     except ValueError:  # which no reader of JSON would take back
-        raise BadInput("env_kwargs: JSON has no infinity and no NaN; 1e300 is a bound that nothing "
-                       "reaches") from None  # fmt: skip
+        raise BadInput(
+            "env_kwargs: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
+        ) from None

@@ -126,15 +126,35 @@ FIXED: dict[str, tuple[str, ...]] = {
 
 # Rules of the experiment rather than of the filter: an unfiltered arm that shares a filtered one's
 # program takes them over, and so does a coin that repeats its drop rates: only the filter differs.
-SHARED_RULES = ("vex_target", "filter", "threshold_schedule", "keep_rate_target", "history",
-                 "decision", "dropped", "max_env_steps_factor", "gae_over", "truncation",
-                 "budget")  # fmt: skip
+SHARED_RULES = (
+    "vex_target",
+    "filter",
+    "threshold_schedule",
+    "keep_rate_target",
+    "history",
+    "decision",
+    "dropped",
+    "max_env_steps_factor",
+    "gae_over",
+    "truncation",
+    "budget",
+)
 
 
 # Fields that `resume` may change: they do not touch what is computed, or only its rounding where
 # another number of devices computes it.
-RESUMABLE = ("processes", "env_processes", "env_timeout", "backend", "device", "devices",
-             "distributed", "checkpoint_every", "keep_checkpoints", "tensorboard")  # fmt: skip
+RESUMABLE = (
+    "processes",
+    "env_processes",
+    "env_timeout",
+    "backend",
+    "device",
+    "devices",
+    "distributed",
+    "checkpoint_every",
+    "keep_checkpoints",
+    "tensorboard",
+)
 # Fields of a stored config that the environment or the place of the run decided.
 SETTLED = ("out", "network", "normalize_observations")
 

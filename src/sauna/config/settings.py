@@ -84,10 +84,13 @@ class Config:
         at_least=0,
         shapes_program=False,
     )
-    backend: str = option("auto", "what steps the environments (auto: the fastest with the same "
-                          "numbers; device: inside the compiled program)",
-                          choices=("auto", "gymnasium", "device"),
-                          shapes_program=False)  # fmt: skip
+    backend: str = option(
+        "auto",
+        "what steps the environments (auto: the fastest with the same "
+        "numbers; device: inside the compiled program)",
+        choices=("auto", "gymnasium", "device"),
+        shapes_program=False,
+    )
     reset: str = option(
         "fresh",
         "on the device, an episode starts in a new state, or in its environment's first one again",
@@ -186,11 +189,16 @@ class Config:
         0.3, "keep where |Vex| / |median| reaches this (eq. 7)", at_least=0, shapes_program=False
     )
     threshold_schedule: str = option(
-        "constant", "over the budget of steps: constant, rising from 0, or falling to 0",
-        choices=("constant", "rising", "falling"))  # fmt: skip
+        "constant",
+        "over the budget of steps: constant, rising from 0, or falling to 0",
+        choices=("constant", "rising", "falling"),
+    )
     keep_rate_target: float = option(
-        0.0, "share of steps to keep; the threshold is moved at every step to hold it (0: off)",
-        at_least=0, at_most=1)  # fmt: skip
+        0.0,
+        "share of steps to keep; the threshold is moved at every step to hold it (0: off)",
+        at_least=0,
+        at_most=1,
+    )
     history: str = option(
         "all", "steps of the rollout whose predictions the median covers", choices=("all", "kept")
     )
@@ -213,8 +221,9 @@ class Config:
         "at a time limit: bootstrap the final value, or treat it as termination",
         choices=("bootstrap", "terminate"),
     )
-    budget: str = option("env", "what `steps` counts: all env steps or kept ones",
-                         choices=("env", "kept"))  # fmt: skip
+    budget: str = option(
+        "env", "what `steps` counts: all env steps or kept ones", choices=("env", "kept")
+    )
     drop_rate: float = option(
         0.0,
         "share of steps that random-drop drops",
@@ -276,20 +285,30 @@ def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:
 # What reads a field that not every run reads. A field named by the user that nothing reads is
 # refused, so that no setting is silently without effect.
 _READERS: dict[str, tuple[str, Any]] = {
-    **dict.fromkeys(("minibatches", "epochs", "clip_range", "clip_value"),
-                    ("algorithm ppo", lambda c: c.algorithm == "ppo")),
+    **dict.fromkeys(
+        ("minibatches", "epochs", "clip_range", "clip_value"),
+        ("algorithm ppo", lambda c: c.algorithm == "ppo"),
+    ),
     "adam_epsilon": ("optimizer adam", lambda c: c.optimizer == "adam"),
-    **dict.fromkeys(("rmsprop_epsilon", "rmsprop_decay"),
-                    ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")),
-    **dict.fromkeys(("threshold", "threshold_schedule"), (
-        "a filter other than none and random-drop, and keep_rate_target 0",
-        lambda c: c.filter not in ("none", "random-drop") and not c.keep_rate_target)),
+    **dict.fromkeys(
+        ("rmsprop_epsilon", "rmsprop_decay"),
+        ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop"),
+    ),
+    **dict.fromkeys(
+        ("threshold", "threshold_schedule"),
+        (
+            "a filter other than none and random-drop, and keep_rate_target 0",
+            lambda c: c.filter not in ("none", "random-drop") and not c.keep_rate_target,
+        ),
+    ),
     "keep_rate_target": ("filter sauna", lambda c: c.filter == "sauna"),
     "history": ("filter sauna", lambda c: c.filter == "sauna"),
     "decision": ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1),
     "dropped": ("a filter", lambda c: c.filter != "none"),
-    "max_env_steps_factor": ("a filter with dropped=replace",
-                             lambda c: c.filter != "none" and c.dropped == "replace"),
+    "max_env_steps_factor": (
+        "a filter with dropped=replace",
+        lambda c: c.filter != "none" and c.dropped == "replace",
+    ),
     "drop_rate": ("filter random-drop", lambda c: c.filter == "random-drop"),
     "drop_rate_from": ("filter random-drop", lambda c: c.filter == "random-drop"),
     "vex_target": ("vex_coef above 0", lambda c: c.vex_coef > 0),
@@ -298,7 +317,7 @@ _READERS: dict[str, tuple[str, Any]] = {
     "env_timeout": ("env_processes above 0", lambda c: c.env_processes > 0),
     "clip_observations": ("normalize_observations", lambda c: c.normalize_observations),
     "clip_rewards": ("normalize_rewards", lambda c: c.normalize_rewards),
-}  # fmt: skip
+}
 
 
 def check_read(configs: list[Config], given: Mapping[str, Any]) -> None:
@@ -348,8 +367,10 @@ def check_consistent(config: Config) -> None:
     if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):
         raise BadInput("drop_rate: random-drop needs a rate, or drop_rate_from=RUN")
     if config.env_processes and "env" in local_parts(config):
-        raise BadInput("env_processes: the environment cannot be imported by another process; "
-                       "put it at the top level of a module")  # fmt: skip
+        raise BadInput(
+            "env_processes: the environment cannot be imported by another process; "
+            "put it at the top level of a module"
+        )
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
     for name in ("network", "vex_target", "filter"):

@@ -105,8 +105,10 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
     def read(observation: Any) -> np.ndarray:
         found = np.array(reader(observation))
         if found.shape != spaces.observation_shape:
-            raise ValueError(f"it says that observations are of shape {spaces.observation_shape}, "
-                             f"and gives {found.shape}")  # fmt: skip
+            raise ValueError(
+                f"it says that observations are of shape {spaces.observation_shape}, "
+                f"and gives {found.shape}"
+            )
         return found
 
     env.action_space.seed(seed)

@@ -61,8 +61,10 @@ def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
     if isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3):
         shape = _channels_last(space.shape)
         if min(shape[:2]) < SMALLEST_IMAGE:
-            raise BadInput(f"observation space {space} is not supported: images need at least "
-                           f"{SMALLEST_IMAGE} x {SMALLEST_IMAGE} pixels")  # fmt: skip
+            raise BadInput(
+                f"observation space {space} is not supported: images need at least "
+                f"{SMALLEST_IMAGE} x {SMALLEST_IMAGE} pixels"
+            )
         return "image", shape
     if isinstance(space, gym.Box):
         return "vector", (math.prod(space.shape),)
@@ -72,8 +74,10 @@ def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
         isinstance(part, gym.Box | gym.Discrete) for part in space.spaces.values()
     ):
         return "vector", (gym.utils.flatdim(space),)
-    raise BadInput(f"observation space {type(space).__name__} is not supported "
-                   "(Box, Discrete, and Dict of those are)")  # fmt: skip
+    raise BadInput(
+        f"observation space {type(space).__name__} is not supported "
+        "(Box, Discrete, and Dict of those are)"
+    )
 
 
 def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
@@ -87,8 +91,10 @@ def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
         return "multi_discrete", tuple(int(n) for n in space.nvec)
     if isinstance(space, gym.MultiBinary) and len(space.shape) == 1:
         return "multi_binary", (int(space.shape[0]),)
-    raise BadInput(f"action space {space} is not supported "
-                   "(continuous Box, Discrete, MultiDiscrete and MultiBinary are)")  # fmt: skip
+    raise BadInput(
+        f"action space {space} is not supported "
+        "(continuous Box, Discrete, MultiDiscrete and MultiBinary are)"
+    )
 
 
 def _channels_last(shape: tuple[int, ...]) -> tuple[int, ...]:

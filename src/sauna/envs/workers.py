@@ -48,8 +48,15 @@ class ProcessEnvs(HostEnvs):
         for worker, part in zip(self._workers, self._parts, strict=True):
             chosen = [list(seeds[i]) for i in part]
             try:
-                worker.say({"kind": "make", "env": env, "kwargs": env_kwargs, "seeds": chosen,
-                            "backend": backend})  # fmt: skip
+                worker.say(
+                    {
+                        "kind": "make",
+                        "env": env,
+                        "kwargs": env_kwargs,
+                        "seeds": chosen,
+                        "backend": backend,
+                    }
+                )
             except BrokenPipeError:
                 pass  # named when its answer is read
         answers = [self._answer(number, max(timeout, STARTING)) for number in range(processes)]

@@ -80,8 +80,9 @@ def iqm_estimate(strata: Sequence[np.ndarray]) -> Estimate:
     if min(map(len, strata)) < 2:
         return Estimate(value, None, None)
     random = np.random.default_rng(SEED)
-    drawn = [scores[random.integers(len(scores), size=(RESAMPLES, len(scores)))]
-             for scores in strata]  # fmt: skip
+    drawn = [
+        scores[random.integers(len(scores), size=(RESAMPLES, len(scores)))] for scores in strata
+    ]
     low, high = np.quantile(iqm(np.concatenate(drawn, -1)), QUANTILES)
     return Estimate(value, float(low), float(high))
 

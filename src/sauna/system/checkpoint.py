@@ -29,8 +29,17 @@ LARGEST = 2**34  # bytes of a state that are read at most
 # How a manifest of an older format becomes one of the next, by the older one's number.
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
 # What a manifest holds; the last five are a run's.
-TYPES = {"format": int, "iteration": int, "sha256": str, "bytes": int, "config": dict,
-         "given": dict, "spaces": list, "members": list, "logs": dict}  # fmt: skip
+TYPES = {
+    "format": int,
+    "iteration": int,
+    "sha256": str,
+    "bytes": int,
+    "config": dict,
+    "given": dict,
+    "spaces": list,
+    "members": list,
+    "logs": dict,
+}
 
 
 Check = Callable[[dict[str, Any]], None]

@@ -36,13 +36,17 @@ def check_plugins(config: Config, spaces: Spaces) -> None:
 
 def _check_target(config: Config) -> None:
     target = make_target(config)
-    shape = (config.rollout_steps * config.envs // config.minibatches,) if target.per_minibatch \
-        else (config.rollout_steps, config.envs)  # fmt: skip
+    shape = (
+        (config.rollout_steps * config.envs // config.minibatches,)
+        if target.per_minibatch
+        else (config.rollout_steps, config.envs)
+    )
     x, episode = jax.ShapeDtypeStruct(shape, jnp.float32), jax.ShapeDtypeStruct(shape, jnp.int32)
     told = jax.eval_shape(target.target, x, x, x, episode)
     if getattr(told, "shape", None) != shape:
-        raise BadInput(f"vex_target: {config.vex_target} gives shape {_shape(told)} instead of "
-                       f"{shape}")  # fmt: skip
+        raise BadInput(
+            f"vex_target: {config.vex_target} gives shape {_shape(told)} instead of {shape}"
+        )
 
 
 def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
@@ -57,9 +61,11 @@ def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
     before = jax.eval_shape(lambda x: x, state)
     after, mask = jax.eval_shape(filter.keep, before, seen, vex, key, hypers)
     if getattr(mask, "shape", None) != (config.envs,) or mask.dtype != bool:
-        raise BadInput(f"filter: {config.filter} gives a mask of shape {_shape(mask)} and type "
-                       f"{getattr(mask, 'dtype', type(mask).__name__)} instead of {(config.envs,)} "
-                       f"and bool")  # fmt: skip
+        raise BadInput(
+            f"filter: {config.filter} gives a mask of shape {_shape(mask)} and type "
+            f"{getattr(mask, 'dtype', type(mask).__name__)} instead of {(config.envs,)} "
+            f"and bool"
+        )
     (old, structure), (new, other) = _flat(before), _flat(after)
     if structure != other or not all(map(_may_become, old, new)):
         raise BadInput(f"filter: {config.filter} gives a state of other arrays than it began with")

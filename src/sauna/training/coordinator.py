@@ -269,8 +269,16 @@ class Coordinator:
         last: dict[str, dict[str, Any]] = {}
         for row in run_directory.rows(self._run.path):
             last[row["member"]] = row
-        kept = ("arm", "seed", "env_steps", "kept_steps", "episodes", "return_mean",
-                "return_mean_reported", "explained_variance")  # fmt: skip
+        kept = (
+            "arm",
+            "seed",
+            "env_steps",
+            "kept_steps",
+            "episodes",
+            "return_mean",
+            "return_mean_reported",
+            "explained_variance",
+        )
         summary = {
             name: {key: row[key] for key in kept if key in row} for name, row in last.items()
         }

@@ -45,8 +45,10 @@ def placed(config: Config) -> Config:
         raise BadInput(f"steps: the device counts to {MOST_STEPS}, not to {most}")
     device = config.device
     if device == "gpu" and not has_gpu():
-        raise BadInput("device: no NVIDIA GPU here that JAX can use; "
-                       "`pip install 'sauna-rl[gpu]'` where there is one")  # fmt: skip
+        raise BadInput(
+            "device: no NVIDIA GPU here that JAX can use; "
+            "`pip install 'sauna-rl[gpu]'` where there is one"
+        )
     if device == "auto":
         device = "gpu" if has_gpu() else "cpu"
     return dataclasses.replace(config, device=device)
@@ -97,8 +99,10 @@ def check_writes(config: Config) -> None:
       BadInput: this is not machine 0.
     """
     if read_place(config.distributed).number:
-        raise BadInput("distributed: machine 0 writes the run; the others follow it with "
-                       "`sauna train`, on the command line")  # fmt: skip
+        raise BadInput(
+            "distributed: machine 0 writes the run; the others follow it with "
+            "`sauna train`, on the command line"
+        )
 
 
 def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
@@ -114,8 +118,10 @@ def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str
         raise BadInput(f"log_std_init: not read with {spaces.action_kind} actions")
     wanted = "normalize_observations" in given and resolve(given).normalize_observations
     if wanted and not config.normalize_observations:
-        raise BadInput(f"normalize_observations: {spaces.observation_kind} observations have "
-                           f"no running moments")  # fmt: skip
+        raise BadInput(
+            f"normalize_observations: {spaces.observation_kind} observations have "
+            f"no running moments"
+        )
 
 
 def _check_placement(config: Config, given: Mapping[str, Any]) -> None:
@@ -206,6 +212,8 @@ def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
             raise BadInput(f"drop_rate_from: {source} has no rows of seed {member.seed}")
     found = [rates[member.seed] for member in everyone]
     if len(json.dumps(found)) > JSON_BYTES // 2:  # what cannot be read again is not begun
-        raise BadInput(f"drop_rate_from: {source} has {max(map(len, found))} iterations, too many "
-                       f"to repeat for {len(found)} seeds in one run")  # fmt: skip
+        raise BadInput(
+            f"drop_rate_from: {source} has {max(map(len, found))} iterations, too many "
+            f"to repeat for {len(found)} seeds in one run"
+        )
     return found

@@ -172,8 +172,10 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     found = look_at(config)
     config = settle(config, found.spaces)
     if stored["spaces"] != json.loads(json.dumps(found.spaces)):
-        raise BadInput(f"{config.env} has other spaces than when the run started: "
-                       f"{found.spaces} instead of {stored['spaces']}")  # fmt: skip
+        raise BadInput(
+            f"{config.env} has other spaces than when the run started: "
+            f"{found.spaces} instead of {stored['spaces']}"
+        )
     before = stored.get("given", {})
     began = as_began(stored["config"], before)
     kept = [f"{name} {value}" for name, value in began.items() if before.get(name) != value]

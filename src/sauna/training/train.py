@@ -63,11 +63,16 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
 
     loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
     before = loaded.manifest.get("versions", {}) if loaded else {}
-    changed = [f"{name} {before[name]} -> {own['versions'].get(name)}" for name in before
-               if before[name] != own["versions"].get(name)]  # fmt: skip
+    changed = [
+        f"{name} {before[name]} -> {own['versions'].get(name)}"
+        for name in before
+        if before[name] != own["versions"].get(name)
+    ]
     if changed:
-        display.say(f"warning: other versions than when the checkpoint was saved "
-                    f"({', '.join(changed)}): the rest may differ in its last bits")  # fmt: skip
+        display.say(
+            f"warning: other versions than when the checkpoint was saved "
+            f"({', '.join(changed)}): the rest may differ in its last bits"
+        )
     return loaded
 
 
@@ -87,5 +92,6 @@ def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> No
         if manifest[name] != json.loads(json.dumps(own[name])):
             differing.append(f"{name} differ")
     if differing:
-        raise BadInput(f"{path}: its checkpoint is of another run or environment: "
-                       f"{'; '.join(differing)}")  # fmt: skip
+        raise BadInput(
+            f"{path}: its checkpoint is of another run or environment: {'; '.join(differing)}"
+        )

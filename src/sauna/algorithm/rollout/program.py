@@ -1,4 +1,4 @@
-"""The members' axis. Everything else in `core/` is written for one member."""
+"""The compiled functions of collecting. Here alone a leading axis of members exists."""
 
 from __future__ import annotations
 
@@ -9,36 +9,29 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.metrics import UpdateMetrics
-from sauna.algorithm.learner.samples import make_batch
-from sauna.algorithm.learner.update import init_state, learn
-from sauna.algorithm.learner.vex_targets import make_target
 from sauna.algorithm.policy.policy import Policy, act, make_policy, score
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.types import Array, Batch, Filter, Hypers, Rollout, TrainState
+from sauna.algorithm.types import Array, Filter, Hypers
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 
 
 class Program(NamedTuple):
-    """The compiled functions of one static config.
+    """The compiled functions of one static config that act, score and decide.
 
     `act` takes a leading member axis `P` on every argument; the others take one member. On CPU a
     member's numbers must not depend on its neighbours, so members are never batched into one
-    matrix product: `act` maps over them, and updates are called one by one.
+    matrix product: `act` maps over them.
     """
 
     config: Config
     policy: Policy
     filter: Filter | None
-    init: Callable[[Array], TrainState]
     draw: Callable[[Array, Any, Any], Array]
     act: Callable[[Array, Any, Any], Array]
     score: Callable[[Any, Any, Any], Array]
     value: Callable[[Any, Any], Array]
     decide: Callable[..., tuple[Any, Array]]
-    make_batch: Callable[[Rollout, Hypers], Batch]
-    learn: Callable[[TrainState, Rollout, Batch, Hypers, Any], tuple[TrainState, UpdateMetrics]]
 
 
 def map_members(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,23 +44,18 @@ def map_members(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def make_program(config: Config, spaces: Spaces) -> Program:
-    """Builds (without compiling) everything that members with this static config run."""
-    policy, target = make_policy(config, spaces), make_target(config)
+    """Builds (without compiling) what members with this static config collect by."""
+    policy = make_policy(config, spaces)
     filter = make_filter(config)
     return Program(
         config=config,
         policy=policy,
         filter=filter,
-        init=jax.jit(partial(init_state, config, policy)),
         draw=jax.jit(partial(draw_noise, policy, config)),
         act=jax.jit(map_members(partial(act, policy))),
         score=jax.jit(partial(score, policy)),
         value=jax.jit(lambda params, observation: policy.apply(params, observation).value),
         decide=jax.jit(partial(decide, filter)) if filter else _nothing_to_decide,
-        make_batch=jax.jit(partial(make_batch, config=config, target=target)),
-        learn=jax.jit(
-            partial(learn, config=config, policy=policy, target=target), donate_argnums=(0,)
-        ),
     )
 
 

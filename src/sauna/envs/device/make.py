@@ -19,8 +19,12 @@ from sauna.envs.device.contract import JaxEnv
 from sauna.system.errors import BadInput, nearest, one_line
 
 # What each backend's package is called where it is imported.
-PACKAGES = {"gymnax": "gymnax", "playground": "mujoco_playground", "brax": "brax",
-            "mjx": "mujoco.mjx"}  # fmt: skip
+PACKAGES = {
+    "gymnax": "gymnax",
+    "playground": "mujoco_playground",
+    "brax": "brax",
+    "mjx": "mujoco.mjx",
+}
 HOST_ENVS = {"sauna/HumanoidFlagrunHarder-v0": "sauna.envs.flagrun.device:flagrun_mjx"}
 
 

@@ -99,9 +99,14 @@ class GymnasiumEnvs(HostEnvs):
 
     def _told(self, ended: bool) -> Step:
         return Step(
-            self._observation, self._reward, self._terminated, self._truncated, self._life_lost,
-            self._final, ended,
-        )  # fmt: skip
+            self._observation,
+            self._reward,
+            self._terminated,
+            self._truncated,
+            self._life_lost,
+            self._final,
+            ended,
+        )
 
     def _take(self, slot: Slot, action: np.ndarray) -> Any:
         """One step of one environment, as Gymnasium gives it."""

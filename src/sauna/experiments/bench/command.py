@@ -31,8 +31,11 @@ from sauna.system.errors import BadInput
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
 _FIELDS = [*FIELDS]
 # The settings of environment and learning, which a trainer without filters has as well.
-_LEARNING = ("env_kwargs", "truncation",
-             *_FIELDS[_FIELDS.index("envs") : _FIELDS.index("clip_rewards") + 1])  # fmt: skip
+_LEARNING = (
+    "env_kwargs",
+    "truncation",
+    *_FIELDS[_FIELDS.index("envs") : _FIELDS.index("clip_rewards") + 1],
+)
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 
 
@@ -112,8 +115,10 @@ def _check_peer(config: Config, given: Mapping[str, Any], against: str) -> None:
         raise BadInput(f"against: {against} is run with PPO, not with {config.algorithm}")
     preset = "atari" if atari else "mujoco" if config.algorithm == "ppo" else "a2c-mujoco"
     if config.preset != preset:
-        raise BadInput(f"preset: {against} runs {config.env} with the settings of {preset}, not of "
-                       f"{config.preset}")  # fmt: skip
+        raise BadInput(
+            f"preset: {against} runs {config.env} with the settings of {preset}, not of "
+            f"{config.preset}"
+        )
     usual = arm_config("ppo", {"preset": preset})
     for name in (name for name in given if name in _LEARNING):
         if getattr(config, name) != getattr(usual, name):
@@ -142,9 +147,11 @@ def bench_scale(
 
 def _split_elsewhere(given: Mapping[str, Any], share: int) -> dict[str, float]:
     """`split` in a process that is set up as a training worker is."""
-    code = ("import json, sys; from sauna.training.worker import configure_jax; configure_jax(); "
-            "from sauna.experiments.bench.split import split; "
-            "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))")  # fmt: skip
+    code = (
+        "import json, sys; from sauna.training.worker import configure_jax; configure_jax(); "
+        "from sauna.experiments.bench.split import split; "
+        "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))"
+    )
     command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(given), str(share)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout.splitlines()[-1]))

@@ -99,8 +99,10 @@ def _check_peer(config: Config) -> None:
     if len(config.seeds) * len(config.arm) > 1:
         raise BadInput("against: brax trains one member; give --seeds 1")
     if config.envs % config.minibatches:
-        raise BadInput(f"minibatches: brax shares environments over them, and {config.envs} are "
-                       f"not divisible by {config.minibatches}")  # fmt: skip
+        raise BadInput(
+            f"minibatches: brax shares environments over them, and {config.envs} are "
+            f"not divisible by {config.minibatches}"
+        )
 
 
 _APART = ("compile_seconds", "peak_memory_mib")  # of a round, and not a rate
@@ -228,9 +230,14 @@ def _parts(population: Any, config: Config, iterations: int) -> dict[str, float]
 
     def collecting(state: Any, setting: Any) -> Any:
         return collect(
-            parts.collecting, state.learner.params, state.collect, setting.keys, setting.hypers,
-            jnp.int32(0), limit,
-        )  # fmt: skip
+            parts.collecting,
+            state.learner.params,
+            state.collect,
+            setting.keys,
+            setting.hypers,
+            jnp.int32(0),
+            limit,
+        )
 
     collect_all = jax.jit(over(collecting))
     rollout = collect_all(state, setting)[1]
@@ -282,8 +289,12 @@ def report_on_device(result: Mapping[str, Any]) -> list[str]:
         f"{result['envs']} environments on {result['machine']['device']}: "
         f"{rates['whole']:,.0f} env steps/s"
     ]
-    names = {"physics": "physics alone", "collect": "collecting alone", "update": "updating alone",
-             "brax": "Brax's PPO"}  # fmt: skip
+    names = {
+        "physics": "physics alone",
+        "collect": "collecting alone",
+        "update": "updating alone",
+        "brax": "Brax's PPO",
+    }
     for name, found in result["ratios"].items():
         lines.append(
             f"  {found['median']:.2f} times {names[name]} ({found['low']:.2f} to "

@@ -46,9 +46,17 @@ def mujoco() -> PPO | A2C:
     if algorithm == "a2c":
         return A2C("MlpPolicy", env, n_steps=5, learning_rate=lambda left: 7e-4 * left, **both)
     return PPO(
-        "MlpPolicy", env, n_steps=2048, batch_size=64, n_epochs=10, clip_range=0.2,
-        clip_range_vf=0.2, gae_lambda=0.95, learning_rate=lambda left: 3e-4 * left, **both,
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        n_steps=2048,
+        batch_size=64,
+        n_epochs=10,
+        clip_range=0.2,
+        clip_range_vf=0.2,
+        gae_lambda=0.95,
+        learning_rate=lambda left: 3e-4 * left,
+        **both,
+    )
 
 
 def atari() -> PPO:
@@ -58,10 +66,19 @@ def atari() -> PPO:
     game = env_id.removeprefix("ALE/").removesuffix("-v5") + "NoFrameskip-v4"
     env = VecFrameStack(make_atari_env(game, n_envs=8, seed=seed), n_stack=4)
     return PPO(
-        "CnnPolicy", env, n_steps=128, batch_size=256, n_epochs=3, clip_range=0.1,
-        clip_range_vf=0.1, vf_coef=1.0, ent_coef=0.01, gae_lambda=0.95,
-        learning_rate=lambda left: 2.5e-4 * left, **common,
-    )  # fmt: skip
+        "CnnPolicy",
+        env,
+        n_steps=128,
+        batch_size=256,
+        n_epochs=3,
+        clip_range=0.1,
+        clip_range_vf=0.1,
+        vf_coef=1.0,
+        ent_coef=0.01,
+        gae_lambda=0.95,
+        learning_rate=lambda left: 2.5e-4 * left,
+        **common,
+    )
 
 
 model = atari() if env_id.startswith("ALE/") else mujoco()

@@ -114,9 +114,13 @@ def _cleanrl(script: Path, python: Path, env: str, seed: int, seconds: float) ->
     last = ""
     with tempfile.TemporaryDirectory() as folder:
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            cwd=folder,
             env=_variables(),
-        )  # fmt: skip
+        )
         assert process.stdout is not None
         for line in process.stdout:
             last = line
@@ -138,10 +142,12 @@ def _failed(errors: str, code: int) -> SaunaError:
 
 def versions(python: Path) -> dict[str, str]:
     """Of what a peer's speed depends on."""
-    code = ("import importlib.metadata as m, json; "
-            "names = {d.name for d in m.distributions()}; "
-            "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy'); "
-            "print(json.dumps({n: m.version(n) for n in wanted if n in names}))")  # fmt: skip
+    code = (
+        "import importlib.metadata as m, json; "
+        "names = {d.name for d in m.distributions()}; "
+        "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy'); "
+        "print(json.dumps({n: m.version(n) for n in wanted if n in names}))"
+    )
     command = [str(python), "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return {"python": sys.version.split()[0], **json.loads(done.stdout)}

@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import mujoco
 import numpy as np
 
+from sauna.algorithm.learner.program import Learner, make_learner
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
@@ -32,9 +33,28 @@ from sauna.training.loop.member_state import Counters
 from sauna.training.loop.metrics import metrics_row
 from sauna.training.prepare import settle
 
-SECTIONS = ("physics", "environment", "normalisation", "inference", "filter", "bookkeeping",
-            "update", "checks", "logging", "checkpoints")  # fmt: skip
+SECTIONS = (
+    "physics",
+    "environment",
+    "normalisation",
+    "inference",
+    "filter",
+    "bookkeeping",
+    "update",
+    "checks",
+    "logging",
+    "checkpoints",
+)
 ITERATIONS = 6
+# The section that each compiled function counts for.
+ACTING = {
+    "draw": "inference",
+    "act": "inference",
+    "score": "inference",
+    "value": "inference",
+    "decide": "filter",
+}
+LEARNING = {"make_batch": "update", "learn": "update"}
 
 
 class Timers:
@@ -80,13 +100,16 @@ def split(settings: dict[str, Any], count: int) -> dict[str, float]:
     job = host.Job(config, found.spaces, kwargs, members(config, given), [], None, 0, True)
     timers = Timers()
     cost = timers.calibrate()
-    program = _timed(make_program(config, found.spaces), timers)
+    program = make_program(config, found.spaces)
+    learner = _timed(make_learner(config, program.policy), LEARNING, timers)
+    acting = {k: v for k, v in ACTING.items() if k != "decide" or program.filter is not None}
+    program = _timed(program, acting, timers)
     envs = host.make_envs(job)
     keys = [member_keys(member.seed) for member in job.members]
     collector = HostCollector(program, found.spaces, envs, keys)
     restore = _wrap_host(collector, envs, timers)
     try:
-        steps, seconds, states, counters = _train(job, program, collector, timers)
+        steps, seconds, states, counters = _train(job, learner, collector, timers)
         saving = _checkpoint_seconds(job, program, collector, states, counters)
     finally:
         restore()
@@ -97,21 +120,20 @@ def split(settings: dict[str, Any], count: int) -> dict[str, float]:
     return {name: 1e6 * timers.seconds[name] / steps for name in SECTIONS}
 
 
-def _timed(program: Program, timers: Timers) -> Program:
-    """The program with timers around what the host calls."""
+Compiled = TypeVar("Compiled", Program, Learner)
+
+
+def _timed(functions: Compiled, sections: Mapping[str, str], timers: Timers) -> Compiled:
+    """The compiled functions with timers around those named in `sections`."""
 
     def waiting(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *arguments: jax.block_until_ready(function(*arguments))
 
-    sections = {"draw": "inference", "act": "inference", "score": "inference",
-                "value": "inference", "make_batch": "update", "learn": "update"}  # fmt: skip
     wrapped: dict[str, Any] = {
-        name: timers.wrap(section, waiting(getattr(program, name)))
+        name: timers.wrap(section, waiting(getattr(functions, name)))
         for name, section in sections.items()
     }
-    if program.filter is not None:
-        wrapped["decide"] = timers.wrap("filter", waiting(program.decide))
-    return program._replace(**wrapped)
+    return functions._replace(**wrapped)
 
 
 def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
@@ -139,11 +161,11 @@ def _physics(envs: Any) -> tuple[Any, str]:
 
 
 def _train(
-    job: host.Job, program: Program, collector: HostCollector, timers: Timers
+    job: host.Job, learner: Learner, collector: HostCollector, timers: Timers
 ) -> tuple[int, float, list[TrainState], list[Counters]]:
     """Env steps and seconds of some iterations after two that are not counted; how they ended."""
     keys = [member_keys(member.seed) for member in job.members]
-    states = [program.init(k.init) for k in keys]
+    states = [learner.init(k.init) for k in keys]
     counters = [Counters() for _ in keys]
     collector.start()
     log = timers.wrap("logging", lambda *row: json.dumps(metrics_row(*row), allow_nan=False))
@@ -158,7 +180,7 @@ def _train(
         collected = collector.collect(params, hypers, iteration, limit)
         for p, member in enumerate(job.members):
             order = minibatch_order(job.config, member.seed, iteration)
-            states[p], learned = host._learn(program, states[p], collected[p], hypers[p], order)
+            states[p], learned = host._learn(learner, states[p], collected[p], hypers[p], order)
             counters[p].add(collected[p])
             steps += collected[p].env_steps
             log(member, job.config, iteration, collected[p], counters[p], learned, hypers[p])

@@ -50,10 +50,12 @@ class TrainedPolicy:
         if self.config.normalize_observations:
             size = artifact.spaces.observation_shape
             parts = {"mean": size, "variance": size, "count": (1,)}
-            self._moments = Moments(**{
-                name: fitting(own, f"observation_moments/{name}", np.zeros(shape))
-                for name, shape in parts.items()
-            })  # fmt: skip
+            self._moments = Moments(
+                **{
+                    name: fitting(own, f"observation_moments/{name}", np.zeros(shape))
+                    for name, shape in parts.items()
+                }
+            )
         self._dtype = artifact.spaces.observation_dtype
         self._act = jax.jit(self._choose, static_argnames="deterministic")
         self._predict = jax.jit(self._heads)

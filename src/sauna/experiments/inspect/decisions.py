@@ -102,8 +102,9 @@ def decide(
     prediction = vex.mean(1) if joint else vex[:, 0]
     if filter is None:
         nothing = np.full(steps, np.nan)
-        return Decisions(prediction, nothing, nothing, np.ones(steps, bool),
-                         list(range(0, steps, room)))  # fmt: skip
+        return Decisions(
+            prediction, nothing, nothing, np.ones(steps, bool), list(range(0, steps, room))
+        )
     before, keep = np.zeros((2, steps)), np.zeros(steps, bool)
     rollouts: list[int] = []
     start = 0

@@ -85,8 +85,11 @@ def examine(
     reward = scaled(config, own, played.reward)
     stream = _stream(policy, played, reward, value, decisions.keep)
     points, shares = principal_components(played.observation)
-    rows = [row for row in run_directory.rows(run)
-            if row["member"] == name and row["iteration"] < iteration]  # fmt: skip
+    rows = [
+        row
+        for row in run_directory.rows(run)
+        if row["member"] == name and row["iteration"] < iteration
+    ]
     return Inspection(
         member=member,
         iteration=iteration,
@@ -137,10 +140,14 @@ def _stream(
     next_value = np.append(value[1:], 0.0).astype(np.float32)
     next_value[ends] = np.where(played.truncated[ends], policy.predict(played.final)[0], 0.0)
     column: Any = {
-        "reward": reward.astype(np.float32), "value": value, "next_value": next_value,
-        "terminated": played.terminated | played.life_lost, "truncated": played.truncated,
-        "valid": np.ones(len(value), bool), "keep": keep,
-    }  # fmt: skip
+        "reward": reward.astype(np.float32),
+        "value": value,
+        "next_value": next_value,
+        "terminated": played.terminated | played.life_lost,
+        "truncated": played.truncated,
+        "valid": np.ones(len(value), bool),
+        "keep": keep,
+    }
     nothing = np.zeros(len(value), np.float32)  # what GAE does not read
     fields = [column.get(field, nothing)[:, None] for field in Rollout._fields]
     return Rollout(*fields)

@@ -15,10 +15,27 @@ from sauna.experiments.inspect.inspection import Inspection, pixel_stride
 from sauna.experiments.report.page import asset, filled, rounded
 from sauna.experiments.report.tables import DOT, table
 
-SETTINGS = ("filter", "threshold", "threshold_schedule", "keep_rate_target", "drop_rate",
-            "history", "decision", "dropped", "vex_target", "vex_coef", "rollout_steps", "envs",
-            "gae_over", "truncation", "gamma", "gae_lambda", "normalize_observations",
-            "normalize_rewards", "sign_rewards")  # fmt: skip
+SETTINGS = (
+    "filter",
+    "threshold",
+    "threshold_schedule",
+    "keep_rate_target",
+    "drop_rate",
+    "history",
+    "decision",
+    "dropped",
+    "vex_target",
+    "vex_coef",
+    "rollout_steps",
+    "envs",
+    "gae_over",
+    "truncation",
+    "gamma",
+    "gae_lambda",
+    "normalize_observations",
+    "normalize_rewards",
+    "sign_rewards",
+)
 
 
 def make_page(found: Inspection, run: Path) -> str:
@@ -122,8 +139,10 @@ def notes(found: Inspection) -> list[str]:
     if not shows_vex(found):
         said.append(f"There is no Vex prediction: {arm} trains no Vex head, and keeps every step.")
     elif not found.head:
-        said.append("The Vex head was not trained (vex_coef 0): its predictions are those of its "
-                    "first weights.")  # fmt: skip
+        said.append(
+            "The Vex head was not trained (vex_coef 0): its predictions are those of its "
+            "first weights."
+        )
     if found.decisions.keep.all() and shows_vex(found):
         rule = "no step falls below the threshold" if compares(found) else f"{arm} keeps all"
         said.append(f"Nothing is dropped: {rule}.")
@@ -133,14 +152,18 @@ def notes(found: Inspection) -> list[str]:
             f"{found.trained_keep_rate:.3f}."
         )
     if config.filter not in ("none", "sauna", "random-drop"):
-        said.append(f"The filter is {config.filter}: what it drops is shaded, its rule is not "
-                    f"drawn.")  # fmt: skip
+        said.append(
+            f"The filter is {config.filter}: what it drops is shaded, its rule is not drawn."
+        )
     if config.filter == "random-drop":
-        said.append(f"random-drop: each step is dropped with a chance of "
-                    f"{found.hypers.drop_rate:.3f}, whatever the head says.")  # fmt: skip
+        said.append(
+            f"random-drop: each step is dropped with a chance of "
+            f"{found.hypers.drop_rate:.3f}, whatever the head says."
+        )
     if found.environments > 1:
-        said.append(f"Decisions look at {found.environments} environments together; environment 0 "
-                    f"is shown.")  # fmt: skip
+        said.append(
+            f"Decisions look at {found.environments} environments together; environment 0 is shown."
+        )
     if not found.played.pictures:
         said.append("There are no pictures.")
     return said
@@ -214,8 +237,7 @@ def _end_of_rollout(found: Inspection) -> str:
     config = found.member.config
     if config.dropped == "mask":
         return f"after {config.rollout_steps:,} env steps"
-    return (f"with its {config.rollout_steps:,}th kept step, or after {capacity(config):,} env "
-            f"steps")  # fmt: skip
+    return f"with its {config.rollout_steps:,}th kept step, or after {capacity(config):,} env steps"
 
 
 def command(found: Inspection, run: Path) -> str:

@@ -30,10 +30,15 @@ DEALS = 10_000
 QUANTITIES = (
     ("keep_rate", "keep rate", "Keep rate", "Share of all env steps that updates learned from."),
     ("entropy", "entropy", "Policy entropy", "In nats, mean over training."),
-    ("coverage", "coverage", "State coverage", "Entropy of the visited observations in nats, by "
-     "nearest neighbours, in one scale for all arms; mean over the checkpoints."),
+    (
+        "coverage",
+        "coverage",
+        "State coverage",
+        "Entropy of the visited observations in nats, by "
+        "nearest neighbours, in one scale for all arms; mean over the checkpoints.",
+    ),
     ("final_return", "return", "Final return", "Training return, mean of the last 100 episodes."),
-)  # fmt: skip
+)
 ASKED = ("entropy", "coverage", "final_return")
 ABOUT = (
     "Against the threshold: keep rate, entropy of the policy, coverage of states, return. Of arms "
@@ -44,8 +49,12 @@ ABOUT = (
     "coin are means over pairs of members with the same drop rates; in brackets 95%, not corrected "
     "for their number."
 )
-LOOKS = {"constant": "sauna", "scheduled": "vex-head", "held keep rate": "ppo",
-         "coin, dropping as much": "random-drop"}  # fmt: skip
+LOOKS = {
+    "constant": "sauna",
+    "scheduled": "vex-head",
+    "held keep rate": "ppo",
+    "coin, dropping as much": "random-drop",
+}
 
 
 class Mark(NamedTuple):
@@ -63,8 +72,11 @@ def extra(measured: Mapping[str, Any]) -> Extra:
     """The section and the figures that the study's page gets."""
     head, *rows = text_table(measured)
     html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
-                  name="Threshold, exploration and return")  # fmt: skip
+    html += table(
+        head,
+        [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
+        name="Threshold, exploration and return",
+    )
     return Extra(TITLE, html, plots(measured), looks())
 
 
@@ -82,10 +94,13 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
     found = []
     for cell in cells:
         numbers = {
-            key: [(m["seed"], float(value)) for m in cell["members"]
-                  if m["points"] and (value := _number(m, key)) is not None]
+            key: [
+                (m["seed"], float(value))
+                for m in cell["members"]
+                if m["points"] and (value := _number(m, key)) is not None
+            ]
             for key, *_ in QUANTITIES
-        }  # fmt: skip
+        }
         kind = _kind(cell)
         stands_for = cell["rates_of"] if kind.startswith("coin") else cell["label"]
         threshold = thresholds.get(stands_for)
@@ -149,8 +164,9 @@ def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | N
 
     None where there are fewer than three thresholds. What is the same for all follows nothing.
     """
-    pairs = [(m.threshold, value) for m in found if m.kind == "constant"
-             for _, value in m.members[key]]  # fmt: skip
+    pairs = [
+        (m.threshold, value) for m in found if m.kind == "constant" for _, value in m.members[key]
+    ]
     if len({threshold for threshold, _ in pairs}) < 3:
         return None
     if len({value for _, value in pairs}) < 2:
@@ -166,8 +182,12 @@ def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | N
 
 def verdicts(measured: Mapping[str, Any]) -> list[str]:
     """The answer for each task, in sentences that claim no more than their tests."""
-    return [said for task in tasks_of(measured) if (found := marks(measured, task))
-            for said in (_verdict(task, found), *_beside_coins(task, found))]  # fmt: skip
+    return [
+        said
+        for task in tasks_of(measured)
+        if (found := marks(measured, task))
+        for said in (_verdict(task, found), *_beside_coins(task, found))
+    ]
 
 
 def beside_coin(arm: Mark, coin: Mark, key: str) -> Estimate:
@@ -183,11 +203,15 @@ def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
     for coin in found:
         if coin.drops_like not in arms:
             continue
-        pairs = len({seed for seed, _ in arms[coin.drops_like].members["coverage"]}
-                    & {seed for seed, _ in coin.members["coverage"]})  # fmt: skip
+        pairs = len(
+            {seed for seed, _ in arms[coin.drops_like].members["coverage"]}
+            & {seed for seed, _ in coin.members["coverage"]}
+        )
         if pairs < 2:
-            yield f"{task}: threshold {coin.drops_like} and a coin that drops as much have too " \
-                  f"few pairs yet."  # fmt: skip
+            yield (
+                f"{task}: threshold {coin.drops_like} and a coin that drops as much have too "
+                f"few pairs yet."
+            )
             continue
         said, apart = [], []
         for key, name, *_ in QUANTITIES:
@@ -197,8 +221,10 @@ def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
                 if low is not None and high is not None and not low <= 0 <= high:
                     apart.append(name)
         kind = f"told apart by {' and '.join(apart)}" if apart else "not told apart"
-        yield f"{task}: threshold {coin.drops_like} and a coin that drops as much are {kind} " \
-              f"(threshold minus coin: {', '.join(said)}; {pairs} pairs)."  # fmt: skip
+        yield (
+            f"{task}: threshold {coin.drops_like} and a coin that drops as much are {kind} "
+            f"(threshold minus coin: {', '.join(said)}; {pairs} pairs)."
+        )
 
 
 def _verdict(task: str, found: Sequence[Mark]) -> str:
@@ -224,8 +250,10 @@ def _verdict(task: str, found: Sequence[Mark]) -> str:
         else:
             dial += ", with no evidence that return follows"
     else:
-        dial = "no evidence that the threshold is a dial of exploration: entropy and coverage do " \
-               "not both follow it one way"  # fmt: skip
+        dial = (
+            "no evidence that the threshold is a dial of exploration: entropy and coverage do "
+            "not both follow it one way"
+        )
     coins = any(mark.drops_like for mark in found)
     if explores in ({1}, {-1}) and coins:
         dial += " (what fewer updates alone do, the coins say)"
@@ -252,8 +280,9 @@ def _lines(found: Sequence[Mark], key: str) -> list[Line]:
     """A line for each kind of arm, its arms in the order of their thresholds."""
     lines = []
     for kind in LOOKS:
-        own = sorted((m for m in found if m.kind == kind and m.members[key]),
-                     key=lambda m: m.threshold)  # fmt: skip
+        own = sorted(
+            (m for m in found if m.kind == kind and m.members[key]), key=lambda m: m.threshold
+        )
         if not own:
             continue
         x: list[float | None] = [mark.threshold for mark in own]

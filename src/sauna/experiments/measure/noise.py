@@ -79,11 +79,15 @@ def draw(stream: Stream, size: int, random: np.random.Generator) -> np.ndarray:
     """Rows `[groups, MINIBATCHES, size]` of a stream, each minibatch without replacement."""
     steps = len(stream.keep)
     coin = random.permutation(steps)[: int(stream.keep.sum())]
-    groups = (np.flatnonzero(stream.keep), np.flatnonzero(~stream.keep), coin,
-              np.flatnonzero(~stream.shifted))  # fmt: skip
-    return np.stack([
-        [random.choice(rows, size, replace=False) for _ in range(MINIBATCHES)] for rows in groups
-    ])  # fmt: skip
+    groups = (
+        np.flatnonzero(stream.keep),
+        np.flatnonzero(~stream.keep),
+        coin,
+        np.flatnonzero(~stream.shifted),
+    )
+    return np.stack(
+        [[random.choice(rows, size, replace=False) for _ in range(MINIBATCHES)] for rows in groups]
+    )
 
 
 def gradients_of(
@@ -99,18 +103,31 @@ def gradients_of(
     advantages = np.concatenate([stream.advantage for stream in reference])
     middle, std = (advantages.mean(), advantages.std() + 1e-8) if standardized else (0.0, 1.0)
     length = max(len(stream.keep) for stream in [*reference, *tested])
-    of_reference = np.stack([
-        whole(standing.params, padded(s.observation, length), padded(s.action, length),
-              padded((s.advantage - middle) / std, length), padded(np.ones(len(s.keep)), length))
-        for s in reference
-    ])  # fmt: skip
+    of_reference = np.stack(
+        [
+            whole(
+                standing.params,
+                padded(s.observation, length),
+                padded(s.action, length),
+                padded((s.advantage - middle) / std, length),
+                padded(np.ones(len(s.keep)), length),
+            )
+            for s in reference
+        ]
+    )
     batches = jax.jit(partial(_minibatches, partial(gradient, standardized=standardized)))
     direction = of_reference.mean(0) / np.linalg.norm(of_reference.mean(0))
     results = [
-        batches(standing.params, direction, padded(s.observation, length), padded(s.action, length),
-             padded(s.advantage, length), rows)
+        batches(
+            standing.params,
+            direction,
+            padded(s.observation, length),
+            padded(s.action, length),
+            padded(s.advantage, length),
+            rows,
+        )
         for s, rows in zip(tested, drawn, strict=True)
-    ]  # fmt: skip
+    ]
     mean, power, cosine = (np.stack(p).astype(np.float64) for p in zip(*results, strict=True))
     kept = np.array([stream.keep.mean() for stream in tested])
     rate = np.stack([kept, 1 - kept, np.ones(len(kept)), 1 - kept], 1)  # a coin stands for all
@@ -124,9 +141,14 @@ def padded(x: np.ndarray, length: int) -> np.ndarray:
 
 
 def _minibatches(
-    gradient: Any, params: Array, direction: Array, observation: Array, action: Array,
-    advantage: Array, rows: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    gradient: Any,
+    params: Array,
+    direction: Array,
+    observation: Array,
+    action: Array,
+    advantage: Array,
+    rows: Array,
+) -> tuple[Array, Array, Array]:
     """Of one stream's minibatches `[X, K, size]`: mean gradient `[X, D]`, mean square, mean cosine.
 
     `direction` `[D]` is the reference's, of length 1.

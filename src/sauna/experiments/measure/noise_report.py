@@ -43,27 +43,59 @@ ABOUT = (
 )
 # key in the figures, title, caption, y axis, its limits
 _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
-    ("snr", "Signal to noise of a minibatch", "Squared length of the group's mean gradient over "
-     "the trace of its covariance.", "signal to noise", None),
-    ("cosine", "Cosine to the gradient of a large batch", "Mean cosine of a minibatch's gradient "
-     "and that of all steps of an independent large batch.", "cosine", (-1.0, 1.0)),
-    ("variance", "Variance of a minibatch's gradient beside a coin's", "Trace of the group's "
-     "covariance over that of what a coin keeps, advantages raw; means are geometric.",
-     "of a coin's variance", None),
-)  # fmt: skip
-HEAD = ("Task", "Arm", "Members", "Keep rate", "SNR kept", "SNR coin", "SNR dropped",
-        "SNR dropped - coin", "SNR dropped - shifted", "SNR per env step, kept - coin",
-        "Cosine dropped - coin", "Alignment of kept", "Variance, kept / coin",
-        "Raw variance, kept / coin", "Raw variance, dropped / coin",
-        "Raw variance, dropped / shifted")  # fmt: skip
+    (
+        "snr",
+        "Signal to noise of a minibatch",
+        "Squared length of the group's mean gradient over the trace of its covariance.",
+        "signal to noise",
+        None,
+    ),
+    (
+        "cosine",
+        "Cosine to the gradient of a large batch",
+        "Mean cosine of a minibatch's gradient "
+        "and that of all steps of an independent large batch.",
+        "cosine",
+        (-1.0, 1.0),
+    ),
+    (
+        "variance",
+        "Variance of a minibatch's gradient beside a coin's",
+        "Trace of the group's "
+        "covariance over that of what a coin keeps, advantages raw; means are geometric.",
+        "of a coin's variance",
+        None,
+    ),
+)
+HEAD = (
+    "Task",
+    "Arm",
+    "Members",
+    "Keep rate",
+    "SNR kept",
+    "SNR coin",
+    "SNR dropped",
+    "SNR dropped - coin",
+    "SNR dropped - shifted",
+    "SNR per env step, kept - coin",
+    "Cosine dropped - coin",
+    "Alignment of kept",
+    "Variance, kept / coin",
+    "Raw variance, kept / coin",
+    "Raw variance, dropped / coin",
+    "Raw variance, dropped / shifted",
+)
 
 
 def extra(measured: Mapping[str, Any]) -> Extra:
     """The section and the figures that the study's page gets."""
     head, *rows = text_table(measured)
     html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
-                  name="Noise of minibatch gradients")  # fmt: skip
+    html += table(
+        head,
+        [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
+        name="Noise of minibatch gradients",
+    )
     return Extra(TITLE, html, plots(measured), looks())
 
 
@@ -122,12 +154,23 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
         ]
         ratios = [
             _ratio(cell, "kept - coin"),
-            *(_ratio(cell, pair, raw=True)
-              for pair in ("kept - coin", "dropped - coin", "dropped - shifted")),
-        ]  # fmt: skip
+            *(
+                _ratio(cell, pair, raw=True)
+                for pair in ("kept - coin", "dropped - coin", "dropped - shifted")
+            ),
+        ]
         rate = f"{np.mean(rates):.2f}" if rates else "-"
-        rows.append([cell["task"], cell["label"], f"{used} of {cell['seeds']}", rate,
-                     *map(shown, values), _alignment(cell), *map(shown_ratio, ratios)])  # fmt: skip
+        rows.append(
+            [
+                cell["task"],
+                cell["label"],
+                f"{used} of {cell['seeds']}",
+                rate,
+                *map(shown, values),
+                _alignment(cell),
+                *map(shown_ratio, ratios),
+            ]
+        )
     return rows
 
 
@@ -173,8 +216,10 @@ def _verdict(cell: Mapping[str, Any]) -> str:
     if not points:
         return f"{where}: not measured yet."
     if not measured:
-        return (f"{where}: no answer, because the filter dropped too few steps at each of "
-                f"{len(points)} checkpoints.")  # fmt: skip
+        return (
+            f"{where}: no answer, because the filter dropped too few steps at each of "
+            f"{len(points)} checkpoints."
+        )
     difference = over_members(cell, "differences", "dropped - coin", "snr")
     dropped, coin = (over_members(cell, "groups", name, "snr") for name in ("dropped", "coin"))
     ratio, kept = _ratio(cell, "dropped - coin", raw=True), _ratio(cell, "kept - coin")

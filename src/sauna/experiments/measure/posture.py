@@ -57,8 +57,12 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
     env.close()
     share = float(seen.mean())
     shown = clearest([episode["upright"] for episode in episodes], share)
-    return {"mode": "sampled", "episodes": episodes, "upright": share,
-            **_draw(artifact, name, kwargs, shown, stills)}  # fmt: skip
+    return {
+        "mode": "sampled",
+        "episodes": episodes,
+        "upright": share,
+        **_draw(artifact, name, kwargs, shown, stills),
+    }
 
 
 def clearest(upright: list[float], share: float) -> int:

@@ -141,8 +141,9 @@ def extra(measured: Mapping[str, Any], place: Path | None = None) -> Extra:
     """
     head, *rows = text_table(measured)
     html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
-                  name="Postures")  # fmt: skip
+    html += table(
+        head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows], name="Postures"
+    )
     looks = style.looks({cell["label"]: cell["arm"] for cell in measured["cells"]})
     return Extra(TITLE, html + (_figure(measured, place) if place else ""), plots(measured), looks)
 
@@ -191,8 +192,13 @@ def _figure(measured: Mapping[str, Any], place: Path) -> str:
     """The strip of stills as HTML, or why there is none."""
     pair = shown_pair(measured)
     if not pair or not all(one.stills for _, one in pair):
-        reasons = [point["not_drawn"] for cell in measured["cells"] for member in cell["members"]
-                   for point in member["points"] if "not_drawn" in point]  # fmt: skip
+        reasons = [
+            point["not_drawn"]
+            for cell in measured["cells"]
+            for member in cell["members"]
+            for point in member["points"]
+            if "not_drawn" in point
+        ]
         return f"<p>No stills: {escape(reasons[0])}.</p>" if reasons else ""
     path = draw_stills(pair, place)
     data = base64.b64encode(path.read_bytes()).decode()
@@ -222,9 +228,16 @@ def plots(measured: Mapping[str, Any]) -> list[Plot]:
     )
     panel = Panel(f"{measured['cells'][0]['task']}, seed {pair[0][1].seed}", lines)
     return [
-        Plot("pair", "Explained variance of one pair", caption, "env steps", "explained variance",
-             (-1.0, 1.0), [panel])
-    ]  # fmt: skip
+        Plot(
+            "pair",
+            "Explained variance of one pair",
+            caption,
+            "env steps",
+            "explained variance",
+            (-1.0, 1.0),
+            [panel],
+        )
+    ]
 
 
 def _posture(one: Posture) -> str:

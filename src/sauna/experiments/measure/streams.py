@@ -88,15 +88,22 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     place = next(p for p, member in enumerate(everyone) if member.name == name)
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)
-    example = program.init(jax.random.key(0)).params
+    example = program.policy.init(jax.random.key(0))
     params = flat_params(program.policy, example, under("params/", arrays))
     counters = Counters.from_arrays(arrays)
     rates = stored["drop_rates"][place] if stored["drop_rates"] else []
     hypers = hypers_now(everyone[place].config, rates, counters, iteration)
     return Standing(
-        config, spaces, everyone[place], iteration, program, params, hypers, arrays,
+        config,
+        spaces,
+        everyone[place],
+        iteration,
+        program,
+        params,
+        hypers,
+        arrays,
         counters.env_steps,
-    )  # fmt: skip
+    )
 
 
 def fresh_streams(

@@ -101,16 +101,32 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
 def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plot]:
     """Every figure that has something to show."""
     plots = [
-        Plot(name, title, caption, "env steps", y_label, limits,
-             _curve_panels(results, summary, metric))
+        Plot(
+            name,
+            title,
+            caption,
+            "env steps",
+            y_label,
+            limits,
+            _curve_panels(results, summary, metric),
+        )
         for name, metric, title, caption, y_label, limits in _CURVES
-    ]  # fmt: skip
-    caption = ("Share of the seeds whose final return is at least x; band: 95% interval, which has "
-               "no width where all seeds or none reach x, and is no certainty there.")  # fmt: skip
+    ]
+    caption = (
+        "Share of the seeds whose final return is at least x; band: 95% interval, which has "
+        "no width where all seeds or none reach x, and is no certainty there."
+    )
     plots.append(
-        Plot("profiles", "Performance profiles", caption, "final return", "share of seeds",
-             (0.0, 1.0), _profile_panels(summary))
-    )  # fmt: skip
+        Plot(
+            "profiles",
+            "Performance profiles",
+            caption,
+            "final return",
+            "share of seeds",
+            (0.0, 1.0),
+            _profile_panels(summary),
+        )
+    )
     return [plot for plot in plots if any(panel.lines for panel in plot.panels)]
 
 
@@ -129,8 +145,16 @@ def _curve_panels(
             curve = curves.get(metric)
             if curve and _any(curve["mean"]):
                 seeds = _seeds(results, task, label, metric)
-                lines.append(Line(label, curves["env_steps"], curve["mean"], curve["low"],
-                                  curve["high"], seeds))  # fmt: skip
+                lines.append(
+                    Line(
+                        label,
+                        curves["env_steps"],
+                        curve["mean"],
+                        curve["low"],
+                        curve["high"],
+                        seeds,
+                    )
+                )
         panels.append(Panel(task, lines))
     return panels
 
@@ -214,8 +238,13 @@ def _draw(plot: Plot, looks: Mapping[str, style.Look]) -> Any:
         _label_axes(axes, plot, panel)
     for axes in grid[len(plot.panels) :]:
         axes.set_visible(False)
-    figure.legend([handles[label] for label in texts], [*texts.values()], handlelength=3.2,
-                  loc="outside lower center", ncols=legend_columns)  # fmt: skip
+    figure.legend(
+        [handles[label] for label in texts],
+        [*texts.values()],
+        handlelength=3.2,
+        loc="outside lower center",
+        ncols=legend_columns,
+    )
     return figure
 
 

@@ -150,11 +150,15 @@ def _check_runs(spec: Spec) -> None:
 def _check_measurable(spec: Spec, config: Config, spaces: Spaces) -> None:
     """Refuses what only an environment's spaces tell of a measurement."""
     if spec.measure == "dial" and not config.normalize_observations:
-        raise BadInput("measure: dial takes its scale from the normaliser of observations, which "
-                       f"{config.env} does not have")  # fmt: skip
+        raise BadInput(
+            "measure: dial takes its scale from the normaliser of observations, which "
+            f"{config.env} does not have"
+        )
     if spec.measure == "noise" and spaces.observation_kind == "image":
-        raise BadInput("measure: noise keeps rollouts of observations in memory, which pictures "
-                       "are too large for")  # fmt: skip
+        raise BadInput(
+            "measure: noise keeps rollouts of observations in memory, which pictures "
+            "are too large for"
+        )
 
 
 def _on_gpu(spec: Spec) -> bool:
@@ -180,8 +184,10 @@ def _train(
         units = units_of(spec, size)
         view = StudyView(spec, units, folder, quiet)
         members = sum(len(unit.seeds) for unit in units)
-        view.say(f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
-                 f"writing to {place}")  # fmt: skip
+        view.say(
+            f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
+            f"writing to {place}"
+        )
         noted: list[int] = []
         with handled(partial(_note_signal, noted)):
             view.open()
@@ -189,8 +195,15 @@ def _train(
                 executor(folder, jobs, view, lambda: bool(noted)).run(units)
                 view.close()
                 if spec.measure:
-                    measure(spec, units, folder, place, min(jobs, cores()), view.say,
-                            lambda: bool(noted))  # fmt: skip
+                    measure(
+                        spec,
+                        units,
+                        folder,
+                        place,
+                        min(jobs, cores()),
+                        view.say,
+                        lambda: bool(noted),
+                    )
             finally:
                 view.close()
     summary = write(spec, units, folder, place, command)
@@ -284,8 +297,17 @@ def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
     """The table and the verdicts, as text."""
-    head = ["task", "arm", "seeds", "final return, IQM", "area, IQM", "mean +- std", "keep rate",
-            "env steps", "P(better)"]  # fmt: skip
+    head = [
+        "task",
+        "arm",
+        "seeds",
+        "final return, IQM",
+        "area, IQM",
+        "mean +- std",
+        "keep rate",
+        "env steps",
+        "P(better)",
+    ]
     digits = digits_of_tasks(summary["table"])
     rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
@@ -301,10 +323,16 @@ def _row(row: Mapping[str, Any], digits: int) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
     mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
     return [
-        row["task"], row["label"], f"{row['seeds']}{failed}", interval(row["final_iqm"], digits),
-        interval(row["area_iqm"], digits), f"{mean} +- {std}", number(row["keep_rate"], 3),
-        number(row["env_steps"], 0), interval(row["improvement"], 2),
-    ]  # fmt: skip
+        row["task"],
+        row["label"],
+        f"{row['seeds']}{failed}",
+        interval(row["final_iqm"], digits),
+        interval(row["area_iqm"], digits),
+        f"{mean} +- {std}",
+        number(row["keep_rate"], 3),
+        number(row["env_steps"], 0),
+        interval(row["improvement"], 2),
+    ]
 
 
 def cores() -> int:

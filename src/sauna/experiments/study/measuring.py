@@ -55,8 +55,10 @@ def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> list[I
     if spec.measure != "dial":
         return items
     scales = {task: scale_of(spec, items, task) for task in spec.tasks}
-    marks = {task: _mark(Path(scale["run"]), scale["iteration"]) if scale else "unscaled"
-             for task, scale in scales.items()}  # fmt: skip
+    marks = {
+        task: _mark(Path(scale["run"]), scale["iteration"]) if scale else "unscaled"
+        for task, scale in scales.items()
+    }
     return [
         item._replace(
             files=[file.with_name(f"{file.stem}_{marks[item.task]}.json") for file in item.files]
@@ -80,10 +82,20 @@ def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator
                     points = POINTS[spec.measure]
                     chosen = checkpoints_at(run, seed, config.steps, points)
                     name = f"{part.name.replace('/', '_')}_{seed}"
-                    files = [place / spec.measure / f"{name}_{i:08d}_{_mark(run, i)}.json"
-                             for i in chosen.values()]  # fmt: skip
-                    yield Item(unit.task, arm.label, arm.arm, seed, run,
-                               [*chosen], [*chosen.values()], files)  # fmt: skip
+                    files = [
+                        place / spec.measure / f"{name}_{i:08d}_{_mark(run, i)}.json"
+                        for i in chosen.values()
+                    ]
+                    yield Item(
+                        unit.task,
+                        arm.label,
+                        arm.arm,
+                        seed,
+                        run,
+                        [*chosen],
+                        [*chosen.values()],
+                        files,
+                    )
 
 
 def _mark(run: Path, iteration: int) -> str:
@@ -141,8 +153,10 @@ def measure(
     if spec.measure == "dial":
         scales = {task: scale_of(spec, items, task) for task in spec.tasks}
         for task in (task for task, scale in scales.items() if scale is None):
-            say(f"{task} is not measured: the first seed of {spec.baseline}, whose normaliser is "
-                f"the scale of all, is not trained")  # fmt: skip
+            say(
+                f"{task} is not measured: the first seed of {spec.baseline}, whose normaliser is "
+                f"the scale of all, is not trained"
+            )
         items = [item for item in items if scales[item.task]]
     waiting = [item for item in items if not item.is_done]
     if not waiting or stopping():
@@ -239,14 +253,25 @@ def gather_measured(
         if not nothing:
             settings = {name: config[name] for name in SETTINGS}
             cells.append(
-                {"task": key[0], "label": key[1], "arm": cell["arm"], "steps": config["steps"],
-                 "baseline": arms[key[1]].baseline, "seeds": len(arms[key[1]].seeds),
-                 "rates_of": arms[key[1]].rates_of, "config": settings, "members": members}
-            )  # fmt: skip
+                {
+                    "task": key[0],
+                    "label": key[1],
+                    "arm": cell["arm"],
+                    "steps": config["steps"],
+                    "baseline": arms[key[1]].baseline,
+                    "seeds": len(arms[key[1]].seeds),
+                    "rates_of": arms[key[1]].rates_of,
+                    "config": settings,
+                    "members": members,
+                }
+            )
     return {
-        "name": spec.name, "command": results["command"], "measure": spec.measure, "cells": cells,
+        "name": spec.name,
+        "command": results["command"],
+        "measure": spec.measure,
+        "cells": cells,
         **{name: results[name] for name in ("versions", "machine", "git")},
-    }  # fmt: skip
+    }
 
 
 def explained(curve: Mapping[str, Any]) -> dict[str, Any]:

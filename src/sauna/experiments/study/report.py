@@ -126,8 +126,10 @@ def filtering(summary: Mapping[str, Any]) -> str:
     found = summary["filtering"]
     if not found:
         return ""
-    return (f"<h3>Is it the filter?</h3><p>{FILTERING}</p>"
-            f"{_shown(found, 'Verdicts on the filter by arm and task')}")  # fmt: skip
+    return (
+        f"<h3>Is it the filter?</h3><p>{FILTERING}</p>"
+        f"{_shown(found, 'Verdicts on the filter by arm and task')}"
+    )
 
 
 def _shown(found: Sequence[Mapping[str, Any]], name: str) -> str:
@@ -185,8 +187,9 @@ def _grid(verdicts: Sequence[Mapping[str, Any]], name: str) -> str:
             else ""
             for task in tasks
         ]
-        rows.append((f'{escape(label)} <span class="interval">than {escape(against)}</span>',
-                     cells))  # fmt: skip
+        rows.append(
+            (f'{escape(label)} <span class="interval">than {escape(against)}</span>', cells)
+        )
     marks = ", ".join(f"{mark} {kind}" for kind, mark in MARKS.items())
     return (
         tables.table(("Better", *map(escape, tasks)), rows, name=name)

@@ -18,8 +18,15 @@ from sauna.system import run_directory
 FORMAT = 1
 POINTS = 60  # of each member's curve that are kept
 METRIC = "mean training return (sampled actions) of the last 100 episodes"
-CURVES = ("return_mean", "keep_rate", "vex_mean", "vex_spread", "vex_median",
-          "explained_variance", "entropy")  # fmt: skip
+CURVES = (
+    "return_mean",
+    "keep_rate",
+    "vex_mean",
+    "vex_spread",
+    "vex_median",
+    "explained_variance",
+    "entropy",
+)
 DIGITS = 6  # significant digits of a curve's points
 
 

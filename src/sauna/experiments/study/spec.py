@@ -121,8 +121,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
             raise BadInput(f"study: unknown key {key!r} in an arm{nearest(key, known)}")
     arm = _text(entry.get("arm", entry.get("label")), "arm")
     if arm not in ARMS:
-        raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)})"
-                       f"{nearest(arm, ARMS)}")  # fmt: skip
+        raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
     tasks = entry.get("tasks", top.get("tasks"))
     if not isinstance(tasks, list) or not tasks or len(set(map(str, tasks))) < len(tasks):
         raise BadInput("study: tasks must be a list of environments, each of them once")
@@ -130,12 +129,17 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
     own = {key: value for key, value in entry.items() if key not in _ARM}
     optional = {key: _text(entry[key], key) for key in ("baseline", "rates_of") if key in entry}
     return Arm(
-        _text(entry.get("label", arm), "label"), arm,
-        {**{key: value for key, value in common.items() if reads(arm, {**common, **own}, key)},
-         **own},
-        tuple(_text(task, "tasks") for task in tasks), seeds,
-        optional.get("baseline"), optional.get("rates_of"),
-    )  # fmt: skip
+        _text(entry.get("label", arm), "label"),
+        arm,
+        {
+            **{key: value for key, value in common.items() if reads(arm, {**common, **own}, key)},
+            **own,
+        },
+        tuple(_text(task, "tasks") for task in tasks),
+        seeds,
+        optional.get("baseline"),
+        optional.get("rates_of"),
+    )
 
 
 def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
@@ -152,29 +156,36 @@ def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
     """Refuses a setting for all arms that none of them takes."""
     for key in common:
         if not any(key in arm.settings for arm in arms):
-            raise BadInput(f"study: {key} is read by none of the arms "
-                           f"{', '.join(arm.label for arm in arms)}")  # fmt: skip
+            raise BadInput(
+                f"study: {key} is read by none of the arms {', '.join(arm.label for arm in arms)}"
+            )
 
 
 def _check_measure(measure: Any, configs: list[Config]) -> None:
     """Refuses a measurement that is not known or would lack what it needs."""
     if measure not in MEASURES:
-        raise BadInput(f"study: measure must be one of {', '.join(MEASURES)}, not {measure!r}"
-                       f"{nearest(str(measure), MEASURES)}")  # fmt: skip
+        raise BadInput(
+            f"study: measure must be one of {', '.join(MEASURES)}, not {measure!r}"
+            f"{nearest(str(measure), MEASURES)}"
+        )
     for config in configs:
         rollout = config.rollout_steps * config.envs
         kept = config.keep_checkpoints * config.checkpoint_every * rollout
         if measure != "torso" and kept < config.steps:
             every = min(config.checkpoint_every, -(-config.steps // (100 * rollout)))
-            raise BadInput("keep_checkpoints: measure needs the checkpoints along training; set "
-                           f"checkpoint_every = {every} and keep_checkpoints = "
-                           f"{-(-config.steps // (every * rollout))}")  # fmt: skip
+            raise BadInput(
+                "keep_checkpoints: measure needs the checkpoints along training; set "
+                f"checkpoint_every = {every} and keep_checkpoints = "
+                f"{-(-config.steps // (every * rollout))}"
+            )
         if config.backend == "device":
             raise BadInput("backend: measure needs environments on the host")
         coin = config.filter == "random-drop" and config.drop_rate_from
         if measure == "dial" and config.filter != "sauna" and not coin:
-            raise BadInput('study: measure = "dial" is of arms that have a threshold, and of coins '
-                           f"that repeat their rates, not of {', '.join(config.arm)}")  # fmt: skip
+            raise BadInput(
+                'study: measure = "dial" is of arms that have a threshold, and of coins '
+                f"that repeat their rates, not of {', '.join(config.arm)}"
+            )
         if measure == "torso" and not config.env.startswith("HalfCheetah"):
             raise BadInput(f'study: measure = "torso" is of HalfCheetah, not of {config.env}')
         if measure == "dial" and not config.normalize_observations:
@@ -212,8 +223,10 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
     if own == arm.label:
         raise BadInput(f"study: {own!r} cannot be its own baseline")
     if own is not None and (missing := set(arm.tasks) - set(known[own].tasks)):
-        raise BadInput(f"study: {own!r}, the baseline of {arm.label!r}, is not trained on "
-                       f"{', '.join(sorted(missing))}")  # fmt: skip
+        raise BadInput(
+            f"study: {own!r}, the baseline of {arm.label!r}, is not trained on "
+            f"{', '.join(sorted(missing))}"
+        )
     if source is not None:
         if ARMS[known[source].arm]["filter"] != "sauna":
             raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")

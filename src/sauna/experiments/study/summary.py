@@ -31,9 +31,22 @@ from sauna.system.errors import BadInput
 
 FORMAT = 1
 # Settings that two arms may differ in and yet differ in the choice of steps alone.
-FILTERS_OWN = ("arm", "seeds", "out", "processes", "filter", "threshold", "threshold_schedule",
-               "keep_rate_target", "history", "decision", "dropped", "max_env_steps_factor",
-               "drop_rate", "drop_rate_from")  # fmt: skip
+FILTERS_OWN = (
+    "arm",
+    "seeds",
+    "out",
+    "processes",
+    "filter",
+    "threshold",
+    "threshold_schedule",
+    "keep_rate_target",
+    "history",
+    "decision",
+    "dropped",
+    "max_env_steps_factor",
+    "drop_rate",
+    "drop_rate_from",
+)
 GRID = 60  # points of a curve at most
 UNFILTERED = 0.99  # mean keep rate from which a difference is not credited to filtering
 MORE_STEPS = 0.01  # relative difference in env steps from which it is mentioned
@@ -86,8 +99,10 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
     if results.get("format") != FORMAT:
         raise BadInput(f"results: format {results.get('format')!r}, but only {FORMAT} is known")
     cells = [_cell(stored, results["baseline"]) for stored in results["cells"]]
-    of_task = {task: [c for c in cells if c.task == task] for task in dict.fromkeys(
-        cell.task for cell in cells)}  # fmt: skip
+    of_task = {
+        task: [c for c in cells if c.task == task]
+        for task in dict.fromkeys(cell.task for cell in cells)
+    }
     found = {task: _compare(of_task[task]) for task in of_task}
     return {
         "verdicts": [
@@ -112,9 +127,17 @@ def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
     )
     complete = [member for member in members if member["status"] == "complete"]
     return Cell(
-        stored["task"], stored["label"], stored["arm"], own, complete, failed, running, waiting,
-        stored.get("rates_of"), stored.get("config") or {},
-    )  # fmt: skip
+        stored["task"],
+        stored["label"],
+        stored["arm"],
+        own,
+        complete,
+        failed,
+        running,
+        waiting,
+        stored.get("rates_of"),
+        stored.get("config") or {},
+    )
 
 
 def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
@@ -199,10 +222,12 @@ def _curves(cell: Cell) -> dict[str, Any]:
     grid = common_grid(env_steps, GRID)
     drawn: dict[str, Any] = {"env_steps": [int(x) for x in grid]}
     for name, bounds in QUANTITIES.items():
-        values = np.array([
-            on_grid(x, np.array(curve.get(name) or [None] * len(x), float), grid)
-            for x, curve in zip(env_steps, curves, strict=True)
-        ]).reshape(len(curves), len(grid))  # fmt: skip
+        values = np.array(
+            [
+                on_grid(x, np.array(curve.get(name) or [None] * len(x), float), grid)
+                for x, curve in zip(env_steps, curves, strict=True)
+            ]
+        ).reshape(len(curves), len(grid))
         lines = mean_interval(values) if len(curves) else (np.zeros(0),) * 3
         mean, low, high = (_listed(np.clip(line, *bounds)) for line in lines)
         drawn[name] = {"mean": mean, "low": low, "high": high}
@@ -240,10 +265,12 @@ def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
         for other in cells
         if ARMS.get(cell.arm, {}).get("filter") == "sauna" and _is_control(other, cell)
     }
-    found = compare({
-        name: (cell.values("final_return"), other.values("final_return"))
-        for name, (cell, other) in pairs.items()
-    })  # fmt: skip
+    found = compare(
+        {
+            name: (cell.values("final_return"), other.values("final_return"))
+            for name, (cell, other) in pairs.items()
+        }
+    )
     family = _family(len(pairs), "comparisons")
     return [_verdict(*pairs[name], comparison, family, tasks) for name, comparison in found.items()]
 
@@ -260,8 +287,11 @@ def _is_control(other: Cell, cell: Cell) -> bool:
     if cell.config and other.config:
         names = (set(cell.config) | set(other.config)) - set(FILTERS_OWN)
         return all(cell.config.get(name) == other.config.get(name) for name in names)
-    return all(getattr(Config(), name) == value for name, value in ARMS[cell.arm].items()
-               if name not in FILTERS_OWN)  # fmt: skip
+    return all(
+        getattr(Config(), name) == value
+        for name, value in ARMS[cell.arm].items()
+        if name not in FILTERS_OWN
+    )
 
 
 def _verdict(
@@ -274,9 +304,14 @@ def _verdict(
         *_circumstances(cell, base),
     ]
     text = " ".join(filter(None, sentences))
-    return {"task": cell.task, "label": cell.label, "against": base.label,
-            "kind": comparison.kind, "chance": comparison.improvement.value,
-            "text": text}  # fmt: skip
+    return {
+        "task": cell.task,
+        "label": cell.label,
+        "against": base.label,
+        "kind": comparison.kind,
+        "chance": comparison.improvement.value,
+        "text": text,
+    }
 
 
 def _family(number: int, what: str) -> str:

@@ -40,10 +40,15 @@ def main_table(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     """Every task and label: returns, chance to be better, rates, steps and seeds."""
     labels = list(dict.fromkeys(cell["label"] for cell in results["cells"]))
     head = (
-        "Arm", "Final return, IQM", f"Better than {escape(results['baseline'])}",
-        "Area under curve, IQM", "Final return, mean &plusmn; std", "Keep rate", "Env steps",
+        "Arm",
+        "Final return, IQM",
+        f"Better than {escape(results['baseline'])}",
+        "Area under curve, IQM",
+        "Final return, mean &plusmn; std",
+        "Keep rate",
+        "Env steps",
         "Seeds",
-    )  # fmt: skip
+    )
     rows: list[tuple[str, Sequence[str]]] = []
     for task, digits in digits_of_tasks(summary["table"]).items():
         of_task = [row for row in summary["table"] if row["task"] == task]
@@ -52,11 +57,14 @@ def main_table(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
             final = with_interval(row["final_iqm"], digits)
             final += _whisker(row, of_task, labels.index(row["label"]))
             cells = (
-                final, _improvement(row, results["baseline"]),
+                final,
+                _improvement(row, results["baseline"]),
                 with_interval(row["area_iqm"], digits),
                 mean_and_std(row["final_mean"], row["final_std"], digits),
-                number(row["keep_rate"], 3), number(row["env_steps"], 0), _seed_counts(row),
-            )  # fmt: skip
+                number(row["keep_rate"], 3),
+                number(row["env_steps"], 0),
+                _seed_counts(row),
+            )
             rows.append((escape(row["label"]), cells))
     return table(head, rows, name="Results by task and arm")
 
@@ -117,9 +125,7 @@ def paper(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     if not tasks:
         return ""
     labels = list(dict.fromkeys(label for task, label in ours if task in tasks))
-    head = (
-        "Task", "PPO, the paper", "SAUNA, the paper", *(f"{escape(x)}, here" for x in labels)
-    )  # fmt: skip
+    head = ("Task", "PPO, the paper", "SAUNA, the paper", *(f"{escape(x)}, here" for x in labels))
     found = []
     for task in tasks:
         cells = [_as_printed(*PAPER[unversioned(task)][arm]) for arm in ("PPO", "SAUNA")]

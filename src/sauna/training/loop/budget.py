@@ -54,8 +54,9 @@ def hypers_now(own: Config, drop_rates: list[float], counters: Counters, iterati
 
 def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
     """The threshold when the share `left` of the budget is left."""
-    return {"constant": threshold, "rising": threshold * (1.0 - left),
-            "falling": threshold * left}[schedule]  # fmt: skip
+    return {"constant": threshold, "rising": threshold * (1.0 - left), "falling": threshold * left}[
+        schedule
+    ]
 
 
 def device_hypers(config: Config, setting: Setting, used: Array, iteration: Array) -> Hypers:

@@ -51,8 +51,14 @@ from sauna.training.loop.multihost import check_shared, join, leave, read_place,
 
 Arrays = dict[str, np.ndarray]
 # What machines that train together may have each in their own way.
-OF_A_MACHINE = ("distributed", "out", "processes", "keep_checkpoints", "tensorboard",
-                "drop_rate_from")  # fmt: skip
+OF_A_MACHINE = (
+    "distributed",
+    "out",
+    "processes",
+    "keep_checkpoints",
+    "tensorboard",
+    "drop_rate_from",
+)
 
 
 def train_on_device(job: Job, reporter: Reporter) -> None:
@@ -68,8 +74,10 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     join(place)
     if not same(place, _settings(job)):
         leave()
-        raise BadInput("distributed: the machines have different settings or versions; give each "
-                       "the same command but for its index")  # fmt: skip
+        raise BadInput(
+            "distributed: the machines have different settings or versions; give each "
+            "the same command but for its index"
+        )
     population = make_population(job)
     if config.device == "gpu":
         reporter.phase(f"on {population.devices} of {len(jax.devices())} GPUs")

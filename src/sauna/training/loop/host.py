@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.learner.program import Learner, make_learner
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.collected import Collected
 from sauna.algorithm.rollout.host import HostCollector
@@ -38,11 +39,12 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
     config, members = job.config, job.members
     reporter.phase("making environments")
     program = make_program(config, job.spaces)
+    learner = make_learner(config, program.policy)
     keys = [member_keys(member.seed) for member in members]
     envs = make_envs(job)
     try:
         collector = HostCollector(program, job.spaces, envs, keys)
-        states, counters = _start(job, program, keys, collector, envs)
+        states, counters = _start(job, program, learner, keys, collector, envs)
         reporter.phase("compiling")
         iteration = job.start
         while any(goes_on(config, c) for c in counters) and reporter.allowance(iteration):
@@ -55,15 +57,20 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
             rows = []
             for p in np.flatnonzero(limit):
                 order = minibatch_order(config, members[p].seed, iteration)
-                states[p], learned = _learn(program, states[p], collected[p], hypers[p], order)
+                states[p], learned = _learn(learner, states[p], collected[p], hypers[p], order)
                 check_finite(members[p], iteration, learned)
                 counters[p].add(collected[p])
                 rows.append(
                     metrics_row(
-                        members[p], config, iteration, collected[p], counters[p], learned,
+                        members[p],
+                        config,
+                        iteration,
+                        collected[p],
+                        counters[p],
+                        learned,
                         hypers[p],
                     )
-                )  # fmt: skip
+                )
             timing = {
                 "env_steps": sum(collected[p].env_steps for p in np.flatnonzero(limit)),
                 "seconds": time.perf_counter() - clock,
@@ -93,9 +100,14 @@ def make_envs(job: Job) -> HostEnvs:
 
 
 def _start(
-    job: Job, program: Program, keys: list[Keys], collector: HostCollector, envs: HostEnvs
+    job: Job,
+    program: Program,
+    learner: Learner,
+    keys: list[Keys],
+    collector: HostCollector,
+    envs: HostEnvs,
 ) -> tuple[list[TrainState], list[Counters]]:
-    states = [program.init(k.init) for k in keys]
+    states = [learner.init(k.init) for k in keys]
     counters = [Counters() for _ in keys]
     collector.start()
     if job.restored is not None:
@@ -107,15 +119,15 @@ def _start(
 
 
 def _learn(
-    program: Program,
+    learner: Learner,
     state: TrainState,
     collected: Collected,
     hypers: Hypers,
     order: np.ndarray,
 ) -> tuple[TrainState, UpdateMetrics]:
     assert collected.rollout is not None
-    batch = program.make_batch(collected.rollout, hypers)
-    state, metrics = program.learn(state, collected.rollout, batch, hypers, order)
+    batch = learner.make_batch(collected.rollout, hypers)
+    state, metrics = learner.learn(state, collected.rollout, batch, hypers, order)
     return state, jax.device_get(metrics)
 
 

@@ -130,8 +130,11 @@ def named_optimizer(state: TrainState) -> dict[str, np.ndarray]:
     if isinstance(optimizer, optax.ScaleByRmsState):
         named = {"rmsprop/mean_square": optimizer.nu}
     else:
-        named = {"adam/count": optimizer.count, "adam/mean": optimizer.mu,
-                 "adam/variance": optimizer.nu}  # fmt: skip
+        named = {
+            "adam/count": optimizer.count,
+            "adam/mean": optimizer.mu,
+            "adam/variance": optimizer.nu,
+        }
     return {name: np.asarray(array) for name, array in named.items()}
 
 

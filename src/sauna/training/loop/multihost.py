@@ -38,8 +38,10 @@ def read_place(text: str) -> Place:
         raise BadInput(f"distributed: {text!r} is not HOST:PORT,COUNT,INDEX")
     count, index = map(int, numbers)
     if not 0 <= index < count or count < 2:
-        raise BadInput(f"distributed: index {index} of {count} machines; it counts from 0, and "
-                       f"takes at least 2")  # fmt: skip
+        raise BadInput(
+            f"distributed: index {index} of {count} machines; it counts from 0, and "
+            f"takes at least 2"
+        )
     return Place(address, count, index)
 
 
@@ -98,10 +100,14 @@ def shared_over(members: int, envs: int, devices: int) -> tuple[int, int]:
     Where several ways use as many devices, members go first.
     """
     return max(
-        ((a, b) for a in range(1, devices + 1) for b in range(1, devices // a + 1)
-         if members % a == 0 and envs % b == 0),
+        (
+            (a, b)
+            for a in range(1, devices + 1)
+            for b in range(1, devices // a + 1)
+            if members % a == 0 and envs % b == 0
+        ),
         key=lambda ways: (ways[0] * ways[1], ways[0]),
-    )  # fmt: skip
+    )
 
 
 def check_shared(name: str, members: int, envs: int, devices: int) -> None:
@@ -112,8 +118,10 @@ def check_shared(name: str, members: int, envs: int, devices: int) -> None:
     """
     over_members, over_envs = shared_over(members, envs, devices)
     if over_members * over_envs < devices:
-        raise BadInput(f"{name}: {members} members of {envs} environments cannot be shared evenly "
-                       f"over {devices} devices")  # fmt: skip
+        raise BadInput(
+            f"{name}: {members} members of {envs} environments cannot be shared evenly "
+            f"over {devices} devices"
+        )
 
 
 class Follower:

@@ -209,9 +209,14 @@ class StudyView:
         for (label, task), cell in shown.items():
             share = sum(map(cell.share, cell.seeds)) / len(cell.seeds)
             table.add_row(
-                task, label, cell.marks(), f"{share:.0%}", number(cell.mean("return_mean"), 1),
-                number(cell.mean("keep_rate"), 3), number(cell.rate(), 0),
-            )  # fmt: skip
+                task,
+                label,
+                cell.marks(),
+                f"{share:.0%}",
+                number(cell.mean("return_mean"), 1),
+                number(cell.mean("keep_rate"), 3),
+                number(cell.rate(), 0),
+            )
         if len(shown) < len(self._cells):
             table.caption = f"{len(self._cells) - len(shown)} more lines are complete or waiting"
         return table

@@ -27,8 +27,10 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError, one_line
 
 RETRIES = 5  # by Ray, of a task whose node or process was lost; then it counts as failed
-TOKENS = ("(its token belongs into the file RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token; "
-          "of a cluster without one, set RAY_AUTH_MODE=disabled)")  # fmt: skip
+TOKENS = (
+    "(its token belongs into the file RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token; "
+    "of a cluster without one, set RAY_AUTH_MODE=disabled)"
+)
 QUIET = {"log_to_driver": False, "logging_level": "ERROR"}
 
 
@@ -177,8 +179,9 @@ class RayExecutor(Executor):
             for said in ray.get(self._hub.take.remote(0.2)):
                 self._hear(said)
         except ray.exceptions.RayError as error:
-            raise SaunaError(f"lost the Ray cluster: {one_line(error)}; running again "
-                             f"continues") from error  # fmt: skip
+            raise SaunaError(
+                f"lost the Ray cluster: {one_line(error)}; running again continues"
+            ) from error
         for ref in ended:
             name = self._tasks.pop(ref)
             self._began.discard(name)

@@ -1,0 +1,112 @@
+"""Promise 3: a member depends on its own seed alone. And off means off."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sauna
+from helpers import SMALL, equal, make_job, own, train_here
+from sauna.config.presets import members, resolve
+from sauna.system import checkpoint
+from sauna.system.errors import BadInput
+
+WORLD = "worlds:Scripted"
+ARMS = [
+    ("ppo", {}),
+    ("sauna-reference", {"threshold": 0.6}),
+    pytest.param("sauna", {"threshold": 0.9}, marks=pytest.mark.slow),
+    pytest.param("random-drop", {"drop_rate": 0.3}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("arm, settings", ARMS)
+def test_member_3_alone_among_six_and_in_another_process(arm, settings, tmp_path) -> None:
+    common = {"arm": arm, "envs": 2, "steps": 256, **settings}
+    alone = train_here(make_job(WORLD, seeds="3,", **common))
+    among = train_here(make_job(WORLD, seeds=6, **common))
+    assert equal(own(alone.final, f"{arm}/3"), own(among.final, f"{arm}/3"))
+    assert alone.rows == [row for row in among.rows if row["seed"] == 3]
+    elsewhere = sauna.train(
+        WORLD,
+        quiet=True,
+        out=tmp_path / "run",
+        **{**SMALL, **common, "seeds": "3,4,5", "processes": 2},
+    )
+    stored = checkpoint.load_newest(elsewhere.path / "checkpoints", print)
+    assert stored is not None
+    assert equal(own(alone.final, f"{arm}/3"), own(stored.arrays, f"{arm}/3"))
+    assert alone.rows == [row for row in elsewhere.metrics if row["seed"] == 3]
+
+
+def test_members_differ() -> None:
+    """The negative control: other seeds give other bits."""
+    final = train_here(make_job(WORLD, arm="ppo", seeds=2)).final
+    assert not np.array_equal(own(final, "ppo/0")["/adam/mean"], own(final, "ppo/1")["/adam/mean"])
+
+
+@pytest.mark.parametrize(
+    "target, trunk",
+    [
+        ("rollout", "separate"),
+        ("sample", "separate"),
+        ("sample", "shared"),
+        pytest.param("minibatch", "separate", marks=pytest.mark.slow),
+        pytest.param("episode", "separate", marks=pytest.mark.slow),
+        pytest.param("rollout", "shared", marks=pytest.mark.slow),
+        pytest.param("minibatch", "shared", marks=pytest.mark.slow),
+        pytest.param("episode", "shared", marks=pytest.mark.slow),
+    ],
+)
+def test_off_means_off(target: str, trunk: str) -> None:
+    """Threshold 0 and c2 = 0 are PPO bit for bit, whatever the head would have learned."""
+    common = {"envs": 2, "trunk": trunk, "steps": 256}
+    ppo = train_here(make_job(WORLD, arm="ppo", **common))
+    job = make_job(WORLD, arm="sauna", threshold=0.0, vex_coef=0.0, **common)
+    off = train_here(job._replace(config=dataclasses.replace(job.config, vex_target=target)))
+    assert equal(own(ppo.final, "ppo/0"), own(off.final, "sauna/0"))
+    on = train_here(make_job(WORLD, arm="sauna", threshold=0.9, vex_target=target, **common))
+    assert not equal(own(ppo.final, "ppo/0"), own(on.final, "sauna/0"))
+
+
+def test_off_is_off_for_the_reference_options_too() -> None:
+    """With everything kept the released GAE is the usual one, time limits being termination."""
+    common = {"envs": 2, "steps": 256, "truncation": "terminate"}
+    ppo = train_here(make_job(WORLD, arm="ppo", **common))
+    off = train_here(make_job(WORLD, arm="sauna-reference", threshold=0.0, vex_coef=0.0, **common))
+    for name, value in own(ppo.final, "ppo/0").items():
+        if name.startswith("/params"):
+            np.testing.assert_allclose(own(off.final, "sauna-reference/0")[name], value, atol=1e-5)
+
+
+def test_arms_that_differ_in_traced_values_share_a_program() -> None:
+    """Each trains as it would alone."""
+    common = {"steps": 256, "envs": 2}
+    together = train_here(
+        make_job(WORLD, arm="ppo,vex-head,sauna", seeds=2, threshold=0.9, **common)
+    )
+    for arm, settings in (("ppo", {}), ("vex-head", {}), ("sauna", {"threshold": 0.9})):
+        alone = train_here(make_job(WORLD, arm=arm, seeds=2, **settings, **common))
+        for seed in (0, 1):
+            one, other = own(alone.final, f"{arm}/{seed}"), own(together.final, f"{arm}/{seed}")
+            assert equal(one, other), (arm, seed)
+
+
+def test_unfiltered_arms_take_the_rules_of_the_filtered_one() -> None:
+    given = {"env": "x", "arm": "ppo,sauna-reference"}
+    ppo, reference = members(resolve(given), given)[0::1][0].config, resolve(given)
+    for name in ("truncation", "budget", "gae_over", "decision"):
+        assert getattr(ppo, name) == getattr(reference, name)
+    assert (ppo.threshold, ppo.vex_coef, reference.vex_coef) == (0.0, 0.0, 0.5)
+
+
+def test_arms_of_other_programs_are_refused() -> None:
+    for arms in ("sauna,random-drop", "sauna,sauna-reference", "sauna,sauna-paper"):
+        with pytest.raises(BadInput, match="shapes the compiled program"):
+            resolve(
+                {"env": "x", "arm": arms, "drop_rate": 0.1}
+                if "random" in arms
+                else {"env": "x", "arm": arms}
+            )

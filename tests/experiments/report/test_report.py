@@ -1,0 +1,403 @@
+"""The report: its numbers are the summary's, it needs nothing but itself, and it works."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import chromium
+from sauna.experiments.report import style
+from sauna.experiments.report.figures import looks_of, plots_of
+from sauna.experiments.study import tables
+from sauna.experiments.study.report import write_report
+from sauna.experiments.study.summary import summarize
+
+HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$x$"
+ERROR = "NotFinite: the loss of <member> is nan\n  at iteration 3"
+METRICS = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
+
+
+def member(seed: int, level: float, keep_rate: float) -> dict[str, Any]:
+    """A complete member whose return climbs to `level` plus a tenth of its seed."""
+    final = level * (1 + 0.1 * seed)
+    steps = list(range(10_000, 110_000, 10_000))
+    curve: dict[str, list[Any]] = {"env_steps": steps}
+    curve["return_mean"] = [None, *(final * (0.1 + 0.1 * i) for i in range(1, 10))]
+    curve["keep_rate"] = [keep_rate] * 10
+    curve["vex_mean"] = [None] * 10 if keep_rate == 1 else [0.05 * i for i in range(10)]
+    curve["explained_variance"] = [0.5 + 0.01 * seed] * 10
+    return {
+        "seed": seed,
+        "status": "complete",
+        "error": None,
+        "final_return": final,
+        "area": 0.6 * final,
+        "env_steps": 100_000,
+        "kept_steps": int(100_000 * keep_rate),
+        "keep_rate": keep_rate,
+        "episodes": 99,
+        "explained_variance": 0.5,
+        "curve": curve,
+    }
+
+
+def make_results(
+    tasks: tuple[str, ...] = ("HalfCheetah-v5", "Reacher-v5"), seeds: int = 5, mark: str = ""
+) -> dict[str, Any]:
+    """Four labels on each task; one failed seed. `mark` is put into every text."""
+    cells = []
+    for task in tasks:
+        for place, label in enumerate(("ppo", "vex-head", "sauna", "sauna 0.8")):
+            level = -7.4 if "Reacher" in task else 1500.5 + 300 * place
+            members = [member(seed, level, 1 - 0.2 * (place > 1)) for seed in range(seeds)]
+            cells.append(
+                {
+                    "task": task + mark,
+                    "label": label + mark,
+                    "arm": label.split()[0],
+                    "preset": "mujoco",
+                    "members": members,
+                    "config": {"steps": 100_000, "threshold": 0.1 * place, "note": mark},
+                    "command": f"sauna train {task} --arm {label} {mark}",
+                }
+            )
+    if seeds > 1:
+        failed = {"status": "failed", "error": ERROR + mark, "final_return": None, "area": None}
+        cells[2]["members"][1].update(failed)
+    return {
+        "format": 1,
+        "name": "compare" + mark,
+        "command": "sauna compare --seeds 5 " + mark,
+        "metric": "mean return of the last 100 episodes" + mark,
+        "baseline": "ppo" + mark,
+        "settings": {"steps": 100_000, "note": mark},
+        "versions": {"sauna": "0.1.0"},
+        "machine": {"cores": 2},
+        "git": None,
+        "cells": cells,
+    }
+
+
+class Page(HTMLParser):
+    """A page's elements `(name, attributes)`, its tables as `row header -> cells`, its texts."""
+
+    VOID = ("meta", "img", "br", "input")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.rows: list[list[str]] = []  # the text of each cell, header cell first
+        self.values: list[list[list[float]]] = []  # the exact numbers of each cell
+        self.scripts: list[str] = []
+        self._open: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, name: str, attributes: list[tuple[str, str | None]]) -> None:
+        found = dict(attributes)
+        self.elements.append((name, found))
+        if name not in self.VOID:
+            self._open.append(name)
+        if name == "tr":
+            self.rows.append([])
+            self.values.append([])
+        elif name in ("td", "th"):
+            self.rows[-1].append("")
+            self.values[-1].append([])
+        elif name == "script":
+            self.scripts.append("")
+        elif name == "data":
+            self.values[-1][-1].append(float(found["value"] or "nan"))
+
+    def handle_endtag(self, name: str) -> None:
+        assert self._open.pop() == name, (name, self._open)
+
+    def handle_data(self, text: str) -> None:
+        self.text += text
+        if {"td", "th"} & set(self._open):
+            self.rows[-1][-1] += text
+        if self._open and self._open[-1] == "script":
+            self.scripts[-1] += text
+
+    def exact(self, label: str) -> list[list[list[float]]]:
+        """The numbers of the rows with this header, without the header."""
+        pairs = zip(self.rows, self.values, strict=True)
+        return [values[1:] for row, values in pairs if row[0] == label]
+
+
+def written(results: dict[str, Any], folder: Path) -> tuple[Page, dict[str, Any]]:
+    summary = summarize(results)
+    text = write_report(results, summary, folder).read_text(encoding="utf-8")
+    return Page(text), summary
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("report")
+    return folder / "report.html", *written(make_results(), folder)
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
+    folder = tmp_path_factory.mktemp("hostile")
+    return folder / "report.html", written(make_results(mark=HOSTILE), folder)[0]
+
+
+def expected(row: dict[str, Any]) -> list[list[float]]:
+    """The cells of a row of the main table, as `summary.json` has them."""
+    cells = (
+        row["final_iqm"],
+        row["improvement"] or [],
+        row["area_iqm"],
+        [row["final_mean"], row["final_std"]],
+        [row["keep_rate"]],
+        [row["env_steps"]],
+        [],
+    )
+    return [[value for value in cell if value is not None] for cell in cells]
+
+
+def test_the_tables_numbers_are_the_summarys(report) -> None:
+    _, page, summary = report
+    for label in ("ppo", "vex-head", "sauna", "sauna 0.8"):
+        rows = [row for row in summary["table"] if row["label"] == label]
+        assert page.exact(label)[: len(rows)] == [expected(row) for row in rows]
+    for row in summary["over_tasks"]:
+        assert page.exact(row["label"])[2] == [[], row["improvement"]]
+    shown = next(row for row in page.rows if row[0] == "sauna")
+    assert shown[7] == "4 1 failed"
+    assert re.fullmatch(r"2,\d{3} \[[12],\d{3}, [23],\d{3}\]", shown[1])
+
+
+def test_the_verdict_is_first_and_whole(report) -> None:
+    _, page, summary = report
+    places = [page.text.index(verdict["text"]) for verdict in summary["verdicts"]]
+    assert places == sorted(places) and len(places) == 6
+    filter = [page.text.index(verdict["text"]) for verdict in summary["filtering"]]
+    assert places[-1] < page.text.index("Is it the filter?") < filter[0] and len(filter) == 4
+    assert filter[-1] < page.text.index("Final return, IQM")
+    chances = {(row["label"], row["task"]): row["improvement"] for row in summary["table"]}
+    for label in ("vex-head", "sauna", "sauna 0.8"):
+        of_tasks = [chances[label, task][:1] for task in ("HalfCheetah-v5", "Reacher-v5")]
+        assert page.exact(f"{label} than ppo") == [of_tasks]
+
+
+def test_what_an_arm_is_better_than_is_said(tmp_path) -> None:
+    results = make_results()
+    for cell in results["cells"]:
+        if cell["label"] == "sauna 0.8":
+            cell["baseline"] = "vex-head"
+    page, _ = written(results, tmp_path)
+    rows = [row for row in page.rows if row[0] == "sauna 0.8"]
+    assert all(row[2].endswith(" than vex-head") for row in rows[:3])  # two tasks, and over both
+    assert not any(" than " in cell for row in page.rows if row[0] == "sauna" for cell in row)
+    assert len(page.exact("sauna 0.8 than vex-head")) == 1
+
+
+def test_what_is_not_known_is_a_dash(tmp_path) -> None:
+    page, summary = written(make_results(tasks=("Custom-v0",), seeds=1), tmp_path)
+    row = next(row for row in page.rows if row[0] == "sauna")
+    assert row == ["sauna", "2,100 -", "1.00 -", "1,260 -", "2,100 ± -", "0.800", "100,000", "1"]
+    assert {verdict["kind"] for verdict in summary["verdicts"]} == {"too few"}
+    assert "Beside the paper" not in page.text  # it does not have this task
+    results = make_results(tasks=("Custom-v0",), seeds=1)
+    for cell in results["cells"]:
+        cell["members"][0].update(status="running", final_return=None, area=None)
+    page, _ = written(results, tmp_path / "new")
+    row = next(row for row in page.rows if row[0] == "sauna")
+    assert row == ["sauna", "-", "-", "-", "-", "-", "-", "0 1 running"]
+    assert "4 not finished yet" in page.text and "nan" not in page.text.lower()
+    assert "There is nothing to draw yet." in page.text
+
+
+def test_failed_seeds_settings_and_commands_are_shown(report) -> None:
+    _, page, _ = report
+    assert ERROR in page.text and "1 failed" in page.text
+    assert "sauna compare --seeds 5" in page.text
+    assert page.text.count("sauna train ") == 8
+    assert ["threshold", "0.2", "0.0"] in page.rows  # the last is where the baseline differs
+    assert ["steps", "100000", ""] in page.rows
+    assert ["git revision", "-"] in page.rows
+    assert sum(row[1:2] == ["failed"] for row in page.rows) == 1
+
+
+def test_the_papers_numbers_stand_beside_ours(report) -> None:
+    _, page, summary = report
+    row = next(row for row in page.rows if row[1:2] == ["2,277 ± 432"])
+    assert row[0] == "HalfCheetah-v5" and row[2] == "2,929 ± 169"
+    ours = [[r["final_mean"], r["final_std"]] for r in summary["table"] if r["task"] == row[0]]
+    assert page.values[page.rows.index(row)][3:] == ours
+    assert next(row for row in page.rows if row[1:2] == ["\u22127.5 ± 0.8"])[0] == "Reacher-v5"
+
+
+def test_the_papers_numbers_do_not_stand_beside_another_algorithm() -> None:
+    cell = {"task": "Hopper-v5", "label": "a2c", "config": {"algorithm": "a2c"}}
+    row = {"task": "Hopper-v5", "label": "a2c", "final_mean": 1.0, "final_std": 0.0}
+    ppo = {"cells": [{**cell, "config": {"algorithm": "ppo"}}]}
+    assert "2,106" in tables.paper(ppo, {"table": [row]})
+    assert tables.paper({"cells": [cell]}, {"table": [row]}) == ""
+
+
+def test_nothing_is_fetched(report) -> None:
+    path, page, _ = report
+    for name, attributes in page.elements:
+        assert name not in ("link", "iframe", "object", "embed", "base", "form")
+        for key in ("src", "href", "srcset", "data", "action", "poster"):
+            value = attributes.get(key) or "#"
+            assert value.startswith(("#", "data:image/svg+xml;base64,")), (name, value)
+    policy = next(a["content"] for n, a in page.elements if a.get("http-equiv"))
+    assert policy is not None and policy.startswith("default-src 'none'; img-src data:;")
+    text = path.read_text()
+    css = text[text.index("<style>") : text.index("</style>")]
+    assert "url(" not in css and "@import" not in css
+    assert not re.search(r"fetch\(|XMLHttpRequest|import\(|WebSocket", page.scripts[1])
+
+
+def test_hostile_text_stays_text(hostile) -> None:
+    _, page = hostile
+    assert [name for name, _ in page.elements].count("script") == len(page.scripts) == 2
+    data = json.loads(page.scripts[0])
+    assert data["labels"][0]["label"] == "ppo" + HOSTILE
+    pictures = [attributes for name, attributes in page.elements if name == "img"]
+    assert all((picture["src"] or "").startswith("data:") for picture in pictures)
+    assert not any(key.startswith("on") for _, found in page.elements for key in found)
+    for text in (f"compare{HOSTILE}", ERROR + HOSTILE, f"--seeds 5 {HOSTILE}"):
+        assert text in page.text
+
+
+def test_tables_and_figures_can_be_read_aloud(report) -> None:
+    _, page, _ = report
+    assert all(a.get("scope") for name, a in page.elements if name == "th")
+    pictures = [a["alt"] or "" for name, a in page.elements if name == "img"]
+    assert len(pictures) == 5
+    assert "ppo 1801 at 100k" in pictures[0] and "Reacher-v5" in pictures[0]
+
+
+def test_figures_hold_what_there_is(report) -> None:
+    path, _, summary = report
+    plots = {plot.name: plot for plot in plots_of(make_results(), summary)}
+    names = ("learning_curves", "keep_rate", "vex", "explained_variance", "profiles")
+    assert tuple(plots) == names
+    assert [line.label for line in plots["vex"].panels[0].lines] == ["sauna", "sauna 0.8"]
+    curves = {line.label: line for line in plots["learning_curves"].panels[0].lines}
+    assert [seed for seed, _, _ in curves["sauna"].seeds] == [0, 2, 3, 4]  # 1 has failed
+    assert curves["ppo"].y == summary["curves"]["HalfCheetah-v5"]["ppo"]["return_mean"]["mean"]
+    files = {file.name for file in (path.parent / "figures").iterdir()}
+    assert files == {f"{name}.{kind}" for name in names for kind in ("png", "svg")}
+
+
+def test_the_same_input_gives_the_same_bytes(report, tmp_path) -> None:
+    path, _, _ = report
+    written(make_results(), tmp_path)
+    for file in sorted(p.relative_to(path.parent) for p in path.parent.rglob("*.*")):
+        assert (tmp_path / file).read_bytes() == (path.parent / file).read_bytes(), file
+
+
+def test_no_two_labels_look_alike() -> None:
+    results = make_results()
+    looks = looks_of(results)
+    assert looks["ppo"].colour == style.COLOURS["ppo"] and looks["ppo"].dash == ()
+    assert looks["sauna"] == style.looks({"sauna": "sauna"})["sauna"]
+    many = {f"sauna {i}": "sauna" for i in range(12)} | {arm: arm for arm in style.COLOURS}
+    many |= {f"mine {i}": f"mine {i}" for i in range(8)}
+    found = style.looks(many)
+    assert list(found) == list(many)
+    assert len({(look.colour, look.dash) for look in found.values()}) == len(many)
+    assert found["sauna"].colour == style.COLOURS["sauna"]  # an arm's own name comes first
+
+
+# In a browser.
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory):
+    executable = chromium.find()
+    if executable is None:
+        pytest.skip(f"no Chromium is installed (looked for {', '.join(chromium.NAMES)})")
+    page = chromium.Page(executable, tmp_path_factory.mktemp("profile"))
+    yield page
+    page.close()
+
+
+SHOWN = """
+Object.fromEntries([...document.querySelectorAll('#results tbody tr:not(.group)')].map((row, i) =>
+  [i, [...row.querySelectorAll('td')].map(cell =>
+    [...cell.querySelectorAll('data')].map(one => Number(one.value)))]))
+"""
+LINES = "document.querySelectorAll('#plots g[data-label=\"sauna 0.8\"]').length"
+
+
+def test_the_page_in_a_browser(browser, report) -> None:
+    path, _, summary = report
+    browser.open(path, width=1280)
+    assert not browser.complaints()
+    assert browser.run("document.images.length") == 0  # every picture gave way to a live figure
+    assert browser.run("document.querySelectorAll('.panel svg[role=img]').length") == 10
+    shown = list(browser.run(SHOWN).values())
+    assert shown[: len(summary["table"])] == [expected(row) for row in summary["table"]]
+    outside = [u for u in browser.requests() if not u.startswith(("data:", path.as_uri()))]
+    assert not outside
+
+
+def test_arms_and_seeds_can_be_switched(browser, report) -> None:
+    browser.open(report[0], width=1280)
+    click = "[...document.querySelectorAll('.legend button')].at(%d).click()"
+    assert browser.run(LINES) == 10 and browser.run("document.querySelector('.seed')") is None
+    browser.run(click % 3)
+    assert browser.run(LINES) == 0
+    browser.run(click % 3)
+    browser.run(click % -1)
+    assert browser.run(LINES) == 10
+    thin = "document.querySelectorAll('#learning_curves .panel:first-child .seed').length"
+    assert browser.run(thin) == 5 + 5 + 4 + 5
+    assert not browser.complaints()
+
+
+def test_values_follow_keyboard_and_pointer(browser, report) -> None:
+    path, _, summary = report
+    browser.open(path, width=1280)
+    readout = "document.querySelector('#learning_curves .readout').innerText"
+    at_end = browser.run(readout)
+    assert at_end.startswith("At 100k env steps")
+    final = summary["curves"]["HalfCheetah-v5"]["ppo"]["return_mean"]["mean"][-1]
+    assert f"{final:,.0f}" in at_end
+    browser.run("document.querySelector('#learning_curves input').focus()")
+    for kind in ("keyDown", "keyUp"):
+        browser.send(
+            "Input.dispatchKeyEvent",
+            type=kind,
+            key="ArrowLeft",
+            code="ArrowLeft",
+            windowsVirtualKeyCode=37,
+        )
+    assert browser.run(readout) != at_end
+    said = "document.querySelector('#learning_curves input').getAttribute('aria-valuetext')"
+    assert "90k env steps: ppo " in browser.run(said)
+    place = "(r => [r.x + r.width / 2, r.y + r.height / 2])(document.querySelectorAll('.plot svg')"
+    browser.run("document.querySelectorAll('.plot svg')[1].scrollIntoView({block: 'center'})")
+    middle = browser.run(f"{place}[1].getBoundingClientRect())")
+    browser.send("Input.dispatchMouseEvent", type="mouseMoved", x=middle[0], y=middle[1])
+    second = browser.run("document.querySelectorAll('#learning_curves .readout')[1].innerText")
+    assert re.match(r"At [45]\d?k env steps", second)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [360, 390])
+def test_a_phone_shows_the_page_without_overflow(browser, report, hostile, width, dark) -> None:
+    for path in (report[0], hostile[0]):
+        browser.open(path, width=width, dark=dark)
+        assert browser.run("document.documentElement.scrollWidth") == width
+        back = browser.run("getComputedStyle(document.body).backgroundColor")
+        assert back == ("rgb(22, 24, 27)" if dark else "rgb(255, 255, 255)")
+        assert not browser.complaints()
+
+
+def test_without_scripts_the_pictures_stay(browser, report) -> None:
+    browser.open(report[0], width=1000, scripts=False)
+    widths = "[...document.images].map(image => image.naturalWidth > 100)"
+    assert browser.run(widths) == [True] * 5

@@ -1,0 +1,146 @@
+"""The arithmetic of the benchmarks; no test looks at a time."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+from sauna import cli
+from sauna.config.presets import resolve
+from sauna.experiments.bench import command, scale
+from sauna.experiments.bench.rates import Clock, alternate, physics_rate, ratio, simulator
+from sauna.experiments.bench.split import SECTIONS, Timers, split
+
+
+def test_the_rate_leaves_out_the_warm_up() -> None:
+    clock = Clock()
+    clock.seen = [(0.0, 0, 10), (50.0, 1, 20), (52.0, 2, 30), (53.0, 3, 40), (57.0, 4, 80)]
+    assert clock.rate() == (80 - 20) / (57 - 50)
+
+
+def test_ratios_are_of_neighbouring_rounds() -> None:
+    assert ratio([10.0, 30.0, 40.0], [5.0, 10.0, 80.0]) == {"median": 2.0, "low": 0.5, "high": 3.0}
+    turns: list[str] = []
+    measures = {name: lambda name=name: turns.append(name) or 1.0 for name in ("a", "b")}
+    assert alternate(measures, 2, lambda text: None) == {"a": [1.0, 1.0], "b": [1.0, 1.0]}
+    assert turns == ["a", "b", "a", "b"]
+
+
+def test_inner_timers_are_taken_off_the_outer_ones(monkeypatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    def spend(seconds: float) -> None:
+        now[0] += seconds
+
+    timers = Timers()
+    inner = timers.wrap("physics", lambda: spend(3.0))
+
+    def step() -> None:
+        spend(1.0)
+        inner()
+        inner()
+
+    timers.wrap("environment", step)()
+    assert (timers.seconds["physics"], timers.seconds["environment"]) == (6.0, 1.0)
+    assert timers.calls == 3
+
+
+def test_sections_add_up_to_a_training_of_a_filtered_arm() -> None:
+    settings = {
+        "env": "InvertedPendulum-v5",
+        "arm": "sauna",
+        "rollout_steps": 64,
+        "steps": 10**5,
+        "minibatches": 4,
+    }
+    found = split(settings, 2)
+    assert tuple(found) == SECTIONS
+    assert all(value > 0 for value in found.values()), found
+
+
+@pytest.mark.parametrize("env", ["Hopper-v5", pytest.param("ALE/Pong-v5", marks=pytest.mark.slow)])
+def test_the_simulator_is_measured_through_episode_ends(env: str) -> None:
+    assert physics_rate(env, {}, processes=1, seconds=0.05) > 0
+
+
+def test_simulators_have_names() -> None:
+    known = {"Hopper-v5": "raw mj_step", "ALE/Pong-v5": "ale-py alone", "CartPole-v1": None}
+    assert {env: simulator(env) for env in known} == known
+
+
+def test_points_of_a_scale_keep_the_batch() -> None:
+    for axis, values in scale.AXES.items():
+        for value in values:
+            config = resolve({"env": "x", "arm": "ppo", **scale.settings_at(axis, value)})
+            assert config.rollout_steps * config.envs == 2048
+
+
+def test_the_report_shows_every_figure() -> None:
+    result = {
+        "env": "Hopper-v5",
+        "arm": ["ppo"],
+        "members": 6,
+        "processes": 2,
+        "rates": {"training": [10.0, 20.0, 30.0], "physics": [40.0, 40.0, 40.0]},
+        "ratios": {"physics": {"median": 0.5, "low": 0.25, "high": 0.75}},
+        "split": {name: 1.0 for name in SECTIONS},
+        "seconds_to_first_env_step": 2.0,
+        "peak_memory_mib": 300.0,
+    }
+    text = "\n".join(command.report(result))
+    for piece in (
+        "20 env steps/s",
+        "0.50 times raw mj_step (0.25 to 0.75",
+        "30.0%",
+        "2.0 s",
+        "300",
+    ):
+        assert piece in text
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--against", "sb4"], "unknown peer 'sb4'"),
+        (["--against", "sb3", "--epochs", "1"], "epochs: not read by sb3"),
+        (["--against", "sb3", "--env-kwargs", '{"a": 1}'], "env_kwargs: not read by sb3"),
+        (["--against", "sb3", "--preset", "mujoco-release"], "settings of mujoco, not of mujoco-r"),
+        (["--against", "sb3", "--algorithm", "a2c"], "settings of a2c-mujoco, not of a2c"),
+        (["ALE/Pong-v5", "--against", "sb3"], "settings of atari, not of mujoco"),
+        (["ALE/Pong-v5", "--against", "sb3", "--preset", "a2c-atari"], "sb3 is run with PPO"),
+        (["--rounds", "0"], "rounds: must be"),
+        (["NoSuch-v0"], "unknown environment"),
+        (["--json", "nowhere/x.json"], "is not a folder"),
+        (["--scale", "--against", "sb3"], "against: not read with --scale"),
+        (["--scale", "--seeds", "3"], "seeds: not read with --scale"),
+        (["--scale", "--iterations", "9"], "iterations: not read with --scale"),
+        (["--iterations", "1"], "iterations: must be"),
+        (["--threshold", "1"], "not read by arm ppo"),
+        (["jax_worlds:walk", "--processes", "2"], "processes: not read"),
+        (["jax_worlds:walk", "--against", "brax"], "brax cannot train"),
+        (["brax/ant", "--against", "brax"], "give --seeds 1"),
+        (["brax/ant", "--against", "brax", "--seeds", "1", "--envs", "3"], "not divisible by 32"),
+    ],
+)
+def test_bad_input(arguments: list[str], message: str, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit:
+        cli.main(["bench", *arguments])
+    assert exit.value.code == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_whole_bench_writes_its_figures(tmp_path, capsys) -> None:
+    file = tmp_path / "bench.json"
+    small = ["--seeds=2", "--rounds=1", "--iterations=2", "--rollout-steps=64", "--minibatches=4"]
+    cli.main(["bench", "InvertedPendulum-v5", *small, "--processes=1", f"--json={file}"])
+    stored = json.loads(file.read_text())
+    assert stored["rates"].keys() == {"training", "physics"}
+    assert stored["machine"] and stored["versions"] and stored["peak_memory_mib"] > 50
+    assert 0 < stored["seconds_to_first_env_step"] < stored["seconds_to_first_row"]
+    assert "times raw mj_step" in capsys.readouterr().out
