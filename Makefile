@@ -28,8 +28,8 @@ BIN := .venv/bin
 	@touch $@ .venv/.run
 
 .venv/.slow: .venv/bin/python pyproject.toml
-	$(BIN)/pip install --quiet -e '.[dev,cluster,brax,playground]'
-	@touch $@ .venv/.dev .venv/.run
+	$(BIN)/pip install --quiet -e '.[dev,docs,cluster,brax,playground]'
+	@touch $@ .venv/.dev .venv/.docs .venv/.run
 
 .venv/.docs: .venv/bin/python pyproject.toml
 	$(BIN)/pip install --quiet -e '.[docs]'
