@@ -33,6 +33,7 @@ LANGUAGES = {"bash", "python", "toml", "text"}
 # Commands that are parsed but not run: they need games, a cluster, a browser or hours.
 NOT_RUN = re.compile(
     r"ALE/|playground/|Flagrun|--distributed|--on ray|^sauna (study|bench|list)|--v"
+    r"|compare (?!InvertedPendulum)"
 )
 EXAMPLE_MODULE = """
 import gymnasium
