@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Iterable
@@ -57,7 +58,9 @@ LABELS = {
 }
 
 
+@functools.cache
 def load(name: str) -> dict[str, Any] | None:
+    """`results/NAME.json`, which nobody changes in memory; None if there is none."""
     path = ROOT / "results" / f"{name}.json"
     return json.loads(path.read_text()) if path.exists() else None
 
