@@ -140,10 +140,19 @@ def preset_table() -> str:
 def arm_table() -> str:
     """A table of the arms."""
     rows = [
-        [f"`{name}`", _sentence(presets.ARM_HELP[name]), _changes(values)]
+        [f"`{name}`", _sentence(presets.ARM_HELP[name]).replace("|", r"\|"), _changes(values)]
         for name, values in presets.ARMS.items()
     ]
     return _table(["Arm", "What it is", "Sets"], rows)
+
+
+def control_table() -> str:
+    """A table of the controls that an arm can be joined to."""
+    rows = [
+        [f"`{name}`", _sentence(text).replace("|", r"\|"), f"`gigaflow+{name}`"]
+        for name, text in presets.CONTROL_HELP.items()
+    ]
+    return _table(["Control", "Takes", "Example"], rows)
 
 
 def _changes(values: dict[str, Any]) -> str:
@@ -173,6 +182,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "settings": settings,
     "presets": preset_table,
     "arms": arm_table,
+    "controls": control_table,
     "api": api,
 }
 

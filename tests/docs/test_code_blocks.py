@@ -25,6 +25,7 @@ from sauna import cli
 from sauna.config.presets import PRESETS, parse_all, resolve
 from sauna.config.settings import FIELDS
 from sauna.envs.make import make_env
+from sauna.experiments.study.command import comparison
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -134,8 +135,8 @@ def check_sauna(arguments: list[str]) -> None:
     if parsed.command not in ("train", "compare") or vars(parsed).get("config"):
         return
     if parsed.command == "compare":
-        settings = {k: v for k, v in settings.items() if k not in ("out", "processes")}
-        parse_all(settings)
+        settings = {k: v for k, v in settings.items() if k not in ("env", "out", "processes")}
+        comparison(parsed.env, tuple(parsed.arms.split(",")), parse_all(settings))
         return
     resolve(settings)
     if ":" in settings["env"]:
