@@ -182,9 +182,9 @@ def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_pa
 
 
 def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
-    """The code block of docs/plugins.md, as it stands there, from the command line."""
-    text = (ROOT / "docs" / "plugins.md").read_text()
-    code = text.split("```python\n")[1].split("```")[0]
+    """The file of docs/how-to/own_selection_rule.md, as it stands there, from the command line."""
+    text = (ROOT / "docs" / "how-to" / "own_selection_rule.md").read_text()
+    code = text.split('```python title="my_filters.py"\n')[1].split("```")[0]
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
     (tmp_path / "my_filters.py").write_text(code)
     command = next(line for line in text.splitlines() if line.startswith("sauna train"))
@@ -217,8 +217,9 @@ def test_filters_of_ones_own_may_be_plain(name: str, tmp_path) -> None:
 
 
 def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
-    text = (ROOT / "docs" / "plugins.md").read_text()
-    (tmp_path / "my_targets.py").write_text(text.split("```python\n")[2].split("```")[0])
+    text = (ROOT / "docs" / "how-to" / "own_vex_target.md").read_text()
+    code = text.split('```python title="my_targets.py"\n')[1].split("```")[0]
+    (tmp_path / "my_targets.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     run = sauna.train(
         "worlds:Scripted", quiet=True, out=tmp_path / "run", vex_target="my_targets:sign", **SMALL
