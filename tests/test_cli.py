@@ -11,8 +11,9 @@ import pytest
 
 from command_line import sauna, small_flags
 from sauna import cli
-from sauna.config.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
+from sauna.config.presets import ARMS, PRESETS, overrides_of, resolve, resolve_run
 from sauna.config.settings import FIELDS, flag, parse, to_json
+from sauna.config.stored import read_stored, stored_config, to_stored
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
@@ -166,21 +167,15 @@ def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> 
     assert rows == [row for row in run_directory.rows(first) if row["seed"] == 4]
 
 
-def test_processes_that_the_machine_decided_are_not_repeated() -> None:
-    given = {"env": WORLD, "seeds": 2}
-    stored = {**to_json(resolve(given)), "processes": 2}
-    assert given_by(stored, given) == given
-    assert given_by(stored, {**given, "processes": 2})["processes"] == 2
-
-
-def test_a_value_edited_in_config_json_counts(tmp_path) -> None:
-    given = {"env": WORLD, "arm": "sauna", "seeds": "2"}
-    stored = to_json(resolve(given))
-    stored["threshold"] = 0.9
-    assert resolve(given_by(stored, given)).threshold == 0.9
-    stored["treshold"] = 0.9
+def test_a_value_edited_in_config_json_counts() -> None:
+    stored = to_stored(resolve_run({"env": WORLD, "arm": "ppo,sauna", "seeds": "2"}))
+    stored["config"] |= {"threshold": 0.9, "processes": 2, "out": "there"}
+    again = overrides_of(read_stored(stored))
+    assert resolve(again).threshold == 0.9
+    assert not {"processes", "out"} & set(again)  # a new run has its own
+    stored["config"]["treshold"] = 0.9
     with pytest.raises(BadInput, match="did you mean 'threshold'"):
-        resolve(given_by(stored, given))
+        read_stored(stored)
 
 
 def test_every_field_has_a_flag_and_a_help_line(capsys) -> None:
@@ -311,8 +306,8 @@ def test_presets_are_the_published_numbers() -> None:
 
 def test_arms_are_the_options_table() -> None:
     def options(arm: str) -> tuple:
-        given = {"env": "x", "arm": arm, **({"drop_rate": 0.1} if arm == "random-drop" else {})}
-        c = members(resolve(given), given)[0].config
+        rate = {"drop_rate": 0.1} if arm == "random-drop" else {}
+        c = resolve_run({"env": "x", "arm": arm, **rate}).arms[arm]
         return (
             c.filter,
             c.vex_coef,

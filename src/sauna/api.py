@@ -9,6 +9,7 @@ from typing import Any
 from sauna.config import local
 from sauna.config.plugins import is_local, name_of
 from sauna.config.presets import COMPARED, parse_all
+from sauna.config.settings import fields_with
 from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
@@ -16,7 +17,7 @@ from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
 
-PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
+PARTS = fields_with("plugin")  # what a user may pass by value
 
 
 class Result:

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
-from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
+from sauna.config.presets import ARM_HELP, COMPARED, PRESET_HELP, overrides_of, parse_all
+from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, fields_with, flag
+from sauna.config.stored import read_stored
 from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
@@ -43,9 +44,7 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    from sauna.config.presets import RESUMABLE
-
-    _add_fields(resume, list(RESUMABLE))
+    _add_fields(resume, list(fields_with("resumable")))
 
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
@@ -78,7 +77,7 @@ def make_parser() -> argparse.ArgumentParser:
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=text)
-    _add_fields(compare, [n for n in FIELDS if n not in (*DECIDED, "arm")])
+    _add_fields(compare, [n for n in FIELDS if n not in (*fields_with("decided_by_study"), "arm")])
 
     study = commands.add_parser(
         "study", help="run a study of the paper's, or your own", allow_abbrev=False
@@ -209,9 +208,7 @@ def _given_from(file: str | None) -> dict[str, Any]:
     from sauna.system.run_directory import read_config_file
 
     stored = read_config_file(Path(file))
-    if "config" in stored and "given" in stored:
-        return given_by(stored["config"], stored["given"])
-    return stored
+    return overrides_of(read_stored(stored)) if "config" in stored else stored
 
 
 def _resume(values: dict[str, Any]) -> None:
@@ -319,12 +316,12 @@ def _bench(values: dict[str, Any]) -> None:
         raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
     for name in ("rounds", "iterations", "scale", "script"):
         del given[name]
-    from sauna.config.presets import plain, resolve
+    from sauna.config.presets import plain, resolve_run
     from sauna.experiments.bench.command import bench, bench_scale, report
     from sauna.experiments.bench.device import bench_on_device, report_on_device, scale_on_device
-    from sauna.training.prepare import placed
+    from sauna.training.prepare import place
 
-    native = placed(resolve(plain(given))).backend == "device"
+    native = place(resolve_run(plain(given))).config.backend == "device"
     if native and values["scale"]:
         result = scale_on_device(given, rounds, iterations, _say)
     elif native:

@@ -17,8 +17,7 @@ from faults.canned import BACKENDS, Trap, played_back, record, trained_here, unt
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
-from sauna.config.presets import RESUMABLE
-from sauna.config.settings import FIELDS, TYPES
+from sauna.config.settings import FIELDS, TYPES, fields_with
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -55,7 +54,7 @@ def _change_everything(
     with played_back(record(world)):
         until(whole, Trap(), world)
         (whole / "summary.json").unlink()
-        names = [name for name in FIELDS if name not in (*RESUMABLE, "out")]
+        names = [name for name in FIELDS if name not in (*fields_with("resumable"), "out")]
         for name in names if least >= 40 else rng.sample(names, least - 3):
             _change_setting(whole, place / "run", name, tally)
         for name in ("format", "spaces", "members"):
@@ -159,7 +158,7 @@ def test_an_older_format_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyP
         checkpoint.load_checkpoint(path)
 
     def rename(old: dict[str, Any]) -> dict[str, Any]:
-        return {**old, "members": old.pop("names"), "format": 1}
+        return {**old, "members": old.pop("names")}
 
     monkeypatch.setitem(checkpoint.MIGRATIONS, 0, rename)
     assert checkpoint.load_checkpoint(path).manifest["members"] == ["ppo/0"]

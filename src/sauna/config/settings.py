@@ -1,4 +1,4 @@
-"""Every choice of a run, as one flat frozen dataclass, and the checks on it.
+"""Every choice of a run, as one flat frozen dataclass.
 
 The dataclass is the single source of the command line's flags and help lines, of `config.json`,
 and of the keyword arguments of `sauna.train`. Nothing here imports JAX, so that bad input is
@@ -13,228 +13,330 @@ import math
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+from sauna.config.fields import option
 from sauna.config.parsing import read_value
-from sauna.config.plugins import import_name, is_local
 from sauna.system.errors import BadInput, nearest
 
 NATIVE = ("gymnax", "playground", "brax", "mjx")  # `NAME/...`: environments of the device alone
-ON_DEVICE = ("reset", "device", "devices", "distributed")  # fields that only the device reads
 FILTERS = ("none", "sauna", "random-drop")
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
 NETWORKS = ("auto", "mlp", "nature-cnn")
 
+_task = partial(option, group="task")
+_run = partial(option, group="run", shapes_program=False)
+_where = partial(option, group="where it runs", shapes_program=False)
+_learning = partial(option, group="learning")
+_network = partial(option, group="network")
+_normalisation = partial(option, group="normalisation")
+_selection = partial(option, group="selection")
+_rule = partial(option, group="selection", rule_of_experiment=True)
 
-def option(
-    default: Any,
-    help: str,
-    *,
-    choices: tuple[str, ...] = (),
-    plugin: bool = False,
-    at_least: float | None = None,
-    above: float | None = None,
-    at_most: float | None = None,
-    shapes_program: bool = True,
-) -> Any:
-    """A config field: its default, its help line, and the values it accepts.
-
-    `plugin` also accepts `module:name`. `shapes_program` is False for a value that is traced (one
-    compiled program serves members that differ in it) or that does not touch training at all.
-    """
-    metadata = {
-        "help": help,
-        "choices": choices,
-        "plugin": plugin,
-        "at_least": at_least,
-        "above": above,
-        "at_most": at_most,
-        "shapes_program": shapes_program,
-    }
-    return dataclasses.field(default=default, metadata=metadata)
+# What reads a field that not every run reads.
+_ON_HOST = ("environments on the host", lambda c: c.backend != "device")
+_WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
+_PPO = ("algorithm ppo", lambda c: c.algorithm == "ppo")
+_ADAM = ("optimizer adam", lambda c: c.optimizer == "adam")
+_RMSPROP = ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")
+_MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
+_CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
+_VECTORS = (
+    "vector observations: others have no running moments",
+    lambda spaces: spaces.observation_kind == "vector",
+)
+_NORMALIZED = ("normalize_observations", lambda c: c.normalize_observations)
+_SCALED = ("normalize_rewards", lambda c: c.normalize_rewards)
+_VEX = ("vex_coef above 0", lambda c: c.vex_coef > 0)
+_FILTERED = ("a filter", lambda c: c.filter != "none")
+_REPLACED = (
+    "a filter with dropped=replace",
+    lambda c: c.filter != "none" and c.dropped == "replace",
+)
+_THRESHOLD = (
+    "a filter other than none and random-drop, and keep_rate_target 0",
+    lambda c: c.filter not in ("none", "random-drop") and not c.keep_rate_target,
+)
+_SAUNA = ("filter sauna", lambda c: c.filter == "sauna")
+_SEVERAL = ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1)
+_RANDOM = ("filter random-drop", lambda c: c.filter == "random-drop")
 
 
 @dataclass(frozen=True)
 class Config:
     """All settings of one run; see each field's help line. Built by `resolve`, never by hand."""
 
-    env: str = option("", "Gymnasium id, or module:function that makes an environment")
-    env_kwargs: str = option("{}", "keyword arguments of the environment, as a JSON object")
-    arm: tuple[str, ...] = option(
-        ("sauna",), "what to train, a name or several: see `sauna list arms`", shapes_program=False
+    env: str = _task(
+        "",
+        "Gymnasium id, or module:function that makes an environment",
+        common=True,
+        plugin=True,
+        decided_by_study=True,
     )
-    algorithm: str = option(
-        "ppo", "how the policy is improved: by PPO, or by A2C", choices=("ppo", "a2c")
+    env_kwargs: str = _task("{}", "keyword arguments of the environment, as a JSON object")
+    arm: tuple[str, ...] = _run(
+        ("sauna",), "what to train, a name or several: see `sauna list arms`", common=True
     )
-    preset: str = option(
-        "mujoco", "settings to start from; with A2C, preset a2c", shapes_program=False
+    algorithm: str = _run(
+        "ppo",
+        "how the policy is improved: by PPO, or by A2C",
+        choices=("ppo", "a2c"),
+        shapes_program=True,
     )
-    seeds: tuple[int, ...] = option(
-        (0,), "how many seeds (6: seeds 0 to 5), or which ones (100,101,110)", shapes_program=False
+    preset: str = _run("mujoco", "settings to start from; with A2C, preset a2c", common=True)
+    seeds: tuple[int, ...] = _run(
+        (0,), "how many seeds (6: seeds 0 to 5), or which ones (100,101,110)", common=True
     )
-    steps: int = option(1_000_000, "env steps per member", at_least=1)
+    steps: int = _run(
+        1_000_000, "env steps per member", at_least=1, common=True, shapes_program=True
+    )
 
-    out: str = option("", "run directory (default: runs/ENV_ARM_TIME)", shapes_program=False)
-    processes: int = option(
-        0, "processes that share the members (0: one per core)", at_least=0, shapes_program=False
+    out: str = _run(
+        "",
+        "run directory (default: runs/ENV_ARM_TIME)",
+        common=True,
+        machine_local=True,
+        decided_by_study=True,
     )
-    env_processes: int = option(
+    processes: int = _where(
+        0,
+        "processes that share the members (0: one per core)",
+        at_least=0,
+        common=True,
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+    env_processes: int = _where(
         0,
         "worker processes that step the environments of one process (0: stepped in-process)",
         at_least=0,
-        shapes_program=False,
+        read_when=_ON_HOST,
+        resumable=True,
     )
-    backend: str = option(
+    backend: str = _where(
         "auto",
         "what steps the environments (auto: the fastest with the same "
         "numbers; device: inside the compiled program)",
         choices=("auto", "gymnasium", "device"),
-        shapes_program=False,
+        resumable=True,
     )
-    reset: str = option(
+    reset: str = _where(
         "fresh",
         "on the device, an episode starts in a new state, or in its environment's first one again",
         choices=("fresh", "cached"),
+        shapes_program=True,
+        device_only=True,
     )
-    device: str = option(
+    device: str = _where(
         "auto",
-        "with backend device: gpu where there is one (auto), or the CPU",
+        "with backend device: gpu if there is one (auto), or the CPU",
         choices=("auto", "cpu", "gpu"),
-        shapes_program=False,
+        common=True,
+        device_only=True,
+        resumable=True,
     )
-    devices: int = option(
+    devices: int = _where(
         0,
         "devices that share the population (0: every GPU, or one CPU; 8 simulates 8 on a CPU)",
         at_least=0,
-        shapes_program=False,
+        device_only=True,
+        resumable=True,
     )
-    distributed: str = option(
+    distributed: str = _where(
         "",
         "HOST:PORT,COUNT,INDEX: COUNT machines train together; INDEX 0 writes the run",
-        shapes_program=False,
+        device_only=True,
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
     )
-    env_timeout: float = option(
-        60.0, "seconds to wait for an environment worker", above=0, shapes_program=False
+    env_timeout: float = _where(
+        60.0,
+        "seconds to wait for an environment worker",
+        above=0,
+        read_when=_WORKERS,
+        resumable=True,
     )
-    checkpoint_every: int = option(
-        50, "iterations between checkpoints", at_least=1, shapes_program=False
+    checkpoint_every: int = _run(50, "iterations between checkpoints", at_least=1, resumable=True)
+    keep_checkpoints: int = _run(
+        2,
+        "how many of the newest checkpoints to keep",
+        at_least=1,
+        resumable=True,
+        machine_local=True,
     )
-    keep_checkpoints: int = option(
-        2, "how many of the newest checkpoints to keep", at_least=1, shapes_program=False
-    )
-    tensorboard: bool = option(
-        False, "also write the metrics for TensorBoard", shapes_program=False
+    tensorboard: bool = _run(
+        False,
+        "also write the metrics for TensorBoard",
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
     )
 
-    envs: int = option(1, "environments per member (N)", at_least=1)
-    rollout_steps: int = option(2048, "kept steps per environment and iteration (T)", at_least=1)
-    minibatches: int = option(32, "minibatches per epoch", at_least=1)
-    epochs: int = option(10, "passes over each rollout", at_least=1)
-    learning_rate: float = option(3e-4, "the optimizer's step size", above=0, shapes_program=False)
-    learning_rate_schedule: str = option(
+    envs: int = _learning(1, "environments per member (N)", at_least=1, common=True)
+    rollout_steps: int = _learning(
+        2048, "kept steps per environment and iteration (T)", at_least=1, common=True
+    )
+    minibatches: int = _learning(32, "minibatches per epoch", at_least=1, read_when=_PPO)
+    epochs: int = _learning(10, "passes over each rollout", at_least=1, read_when=_PPO)
+    learning_rate: float = _learning(
+        3e-4, "the optimizer's step size", above=0, common=True, shapes_program=False
+    )
+    learning_rate_schedule: str = _learning(
         "linear", "over the budget of steps: to 0, or constant", choices=("linear", "constant")
     )
-    optimizer: str = option("adam", "what scales the gradient", choices=("adam", "rmsprop"))
-    adam_epsilon: float = option(1e-5, "Adam's epsilon", above=0)
-    rmsprop_epsilon: float = option(1e-5, "RMSProp's epsilon, under the root", above=0)
-    rmsprop_decay: float = option(
-        0.99, "of RMSProp's running mean square", at_least=0, at_most=0.999999
+    optimizer: str = _learning("adam", "what scales the gradient", choices=("adam", "rmsprop"))
+    adam_epsilon: float = _learning(1e-5, "Adam's epsilon", above=0, read_when=_ADAM)
+    rmsprop_epsilon: float = _learning(
+        1e-5, "RMSProp's epsilon, under the root", above=0, read_when=_RMSPROP
     )
-    max_grad_norm: float = option(
+    rmsprop_decay: float = _learning(
+        0.99,
+        "of RMSProp's running mean square",
+        at_least=0,
+        at_most=0.999999,
+        read_when=_RMSPROP,
+    )
+    max_grad_norm: float = _learning(
         0.5, "the gradient is scaled down to this global norm", above=0, shapes_program=False
     )
-    clip_range: float = option(
-        0.2, "clip range of the probability ratio (and the value)", above=0, shapes_program=False
+    clip_range: float = _learning(
+        0.2,
+        "clip range of the probability ratio (and the value)",
+        above=0,
+        shapes_program=False,
+        read_when=_PPO,
     )
-    clip_value: bool = option(True, "clip the value function's change as the ratio's")
-    normalize_advantages: bool = option(True, "standardise the advantages of each minibatch")
-    entropy_coef: float = option(
+    clip_value: bool = _learning(
+        True, "clip the value function's change as the ratio's", read_when=_PPO
+    )
+    normalize_advantages: bool = _learning(True, "standardise the advantages of each minibatch")
+    entropy_coef: float = _learning(
         0.0, "weight of the entropy bonus", at_least=0, shapes_program=False
     )
-    value_coef: float = option(0.5, "weight of the value loss", at_least=0, shapes_program=False)
-    gamma: float = option(0.99, "discount", at_least=0, at_most=1, shapes_program=False)
-    gae_lambda: float = option(
+    value_coef: float = _learning(0.5, "weight of the value loss", at_least=0, shapes_program=False)
+    gamma: float = _learning(0.99, "discount", at_least=0, at_most=1, shapes_program=False)
+    gae_lambda: float = _learning(
         0.95, "lambda of the advantage estimate", at_least=0, at_most=1, shapes_program=False
     )
 
-    network: str = option(
+    network: str = _network(
         "auto", "trunk (auto: nature-cnn for images, else mlp)", choices=NETWORKS, plugin=True
     )
-    hidden: tuple[int, ...] = option((64, 64), "widths of the MLP's hidden layers", at_least=1)
-    activation: str = option("tanh", "the MLP's activation", choices=("tanh", "relu"))
-    trunk: str = option(
+    hidden: tuple[int, ...] = _network(
+        (64, 64), "widths of the MLP's hidden layers", at_least=1, read_when=_MLP
+    )
+    activation: str = _network(
+        "tanh", "the MLP's activation", choices=("tanh", "relu"), read_when=_MLP
+    )
+    trunk: str = _network(
         "separate", "whether policy and value share a trunk", choices=("separate", "shared")
     )
-    log_std_init: float = option(0.0, "first log standard deviation of continuous actions")
-    normalize_observations: bool = option(
-        True, "running mean and variance of vector observations (images are divided by 255)"
+    log_std_init: float = _network(
+        0.0, "first log standard deviation of continuous actions", needs_spaces=_CONTINUOUS
     )
-    sign_rewards: bool = option(
-        False, "learn from each reward's sign, -1, 0 or 1 (returns are told in full)"
+    normalize_observations: bool = _normalisation(
+        True,
+        "running mean and variance of vector observations (images are divided by 255)",
+        needs_spaces=_VECTORS,
     )
-    normalize_rewards: bool = option(True, "divide rewards by the std of the discounted return")
-    clip_observations: float = option(10.0, "bound of normalised observations", above=0)
-    clip_rewards: float = option(10.0, "bound of normalised rewards", above=0)
+    sign_rewards: bool = _normalisation(
+        False, "learn from each reward's sign, -1, 0 or 1 (returns are reported in full)"
+    )
+    normalize_rewards: bool = _normalisation(
+        True, "divide rewards by the std of the discounted return"
+    )
+    clip_observations: float = _normalisation(
+        10.0, "bound of normalised observations", above=0, read_when=_NORMALIZED
+    )
+    clip_rewards: float = _normalisation(
+        10.0, "bound of normalised rewards", above=0, read_when=_SCALED
+    )
 
-    vex_target: str = option(
-        "sample", "what the Vex head regresses", choices=VEX_TARGETS, plugin=True
+    vex_target: str = _rule(
+        "sample",
+        "what the Vex head regresses",
+        choices=VEX_TARGETS,
+        plugin=True,
+        read_when=_VEX,
     )
-    vex_coef: float = option(
+    vex_coef: float = _selection(
         0.5, "weight of the Vex loss (c2 of eq. 6)", at_least=0, shapes_program=False
     )
-    filter: str = option(
-        "sauna", "which transitions the update keeps", choices=FILTERS, plugin=True
+    filter: str = _rule("sauna", "which transitions the update keeps", choices=FILTERS, plugin=True)
+    threshold: float = _selection(
+        0.3,
+        "keep if |Vex| / |median| reaches this (eq. 7)",
+        at_least=0,
+        shapes_program=False,
+        read_when=_THRESHOLD,
     )
-    threshold: float = option(
-        0.3, "keep where |Vex| / |median| reaches this (eq. 7)", at_least=0, shapes_program=False
-    )
-    threshold_schedule: str = option(
+    threshold_schedule: str = _rule(
         "constant",
         "over the budget of steps: constant, rising from 0, or falling to 0",
         choices=("constant", "rising", "falling"),
+        read_when=_THRESHOLD,
     )
-    keep_rate_target: float = option(
+    keep_rate_target: float = _rule(
         0.0,
         "share of steps to keep; the threshold is moved at every step to hold it (0: off)",
         at_least=0,
         at_most=1,
+        read_when=_SAUNA,
     )
-    history: str = option(
-        "all", "steps of the rollout whose predictions the median covers", choices=("all", "kept")
+    history: str = _rule(
+        "all",
+        "steps of the rollout whose predictions the median covers",
+        choices=("all", "kept"),
+        read_when=_SAUNA,
     )
-    decision: str = option(
-        "env", "decide for each env, or jointly for a vector step", choices=("env", "joint")
+    decision: str = _rule(
+        "env",
+        "decide for each env, or jointly for a vector step",
+        choices=("env", "joint"),
+        read_when=_SEVERAL,
     )
-    dropped: str = option(
+    dropped: str = _rule(
         "replace",
         "dropped steps: replaced by further env steps, or masked",
         choices=("replace", "mask"),
+        read_when=_FILTERED,
     )
-    max_env_steps_factor: int = option(
-        4, "with replace: at most this many times T env steps are tried", at_least=1
+    max_env_steps_factor: int = _rule(
+        4,
+        "with replace: at most this many times T env steps are tried",
+        at_least=1,
+        read_when=_REPLACED,
     )
-    gae_over: str = option(
+    gae_over: str = _rule(
         "all", "advantages over all env steps, or over the kept ones", choices=("all", "kept")
     )
-    truncation: str = option(
+    truncation: str = _learning(
         "bootstrap",
         "at a time limit: bootstrap the final value, or treat it as termination",
         choices=("bootstrap", "terminate"),
+        rule_of_experiment=True,
     )
-    budget: str = option(
+    budget: str = _rule(
         "env", "what `steps` counts: all env steps or kept ones", choices=("env", "kept")
     )
-    drop_rate: float = option(
+    drop_rate: float = _selection(
         0.0,
         "share of steps that random-drop drops",
         at_least=0,
         at_most=0.99,
         shapes_program=False,
+        read_when=_RANDOM,
     )
-    drop_rate_from: str = option(
+    drop_rate_from: str = _selection(
         "",
         "a SAUNA run whose measured rates random-drop repeats, seed by seed",
         shapes_program=False,
+        read_when=_RANDOM,
+        machine_local=True,
+        decided_by_study=True,
     )
 
 
@@ -242,13 +344,18 @@ FIELDS = {field.name: field for field in dataclasses.fields(Config)}
 TYPES = typing.get_type_hints(Config)
 
 
+def fields_with(mark: str) -> tuple[str, ...]:
+    """Names the fields whose `option` has a mark, say `resumable`."""
+    return tuple(name for name, field in FIELDS.items() if field.metadata[mark])
+
+
 def flag(name: str) -> str:
-    """`rollout_steps` -> `--rollout-steps`."""
+    """Spells a field as a flag: `rollout_steps` -> `--rollout-steps`."""
     return "--" + name.replace("_", "-")
 
 
 def parse(name: str, value: Any) -> Any:
-    """`value` (text from a command line, or a Python or JSON value) as field `name`'s type.
+    """Reads `value` (text of a command line, or a Python or JSON value) as field `name`'s type.
 
     Raises:
       BadInput: the value cannot be read as that type, or lies outside what the field accepts.
@@ -282,110 +389,8 @@ def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:
         raise BadInput(f"{name}: must be at most {meta['at_most']}, not {value}")
 
 
-# What reads a field that not every run reads. A field named by the user that nothing reads is
-# refused, so that no setting is silently without effect.
-_READERS: dict[str, tuple[str, Any]] = {
-    **dict.fromkeys(
-        ("minibatches", "epochs", "clip_range", "clip_value"),
-        ("algorithm ppo", lambda c: c.algorithm == "ppo"),
-    ),
-    "adam_epsilon": ("optimizer adam", lambda c: c.optimizer == "adam"),
-    **dict.fromkeys(
-        ("rmsprop_epsilon", "rmsprop_decay"),
-        ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop"),
-    ),
-    **dict.fromkeys(
-        ("threshold", "threshold_schedule"),
-        (
-            "a filter other than none and random-drop, and keep_rate_target 0",
-            lambda c: c.filter not in ("none", "random-drop") and not c.keep_rate_target,
-        ),
-    ),
-    "keep_rate_target": ("filter sauna", lambda c: c.filter == "sauna"),
-    "history": ("filter sauna", lambda c: c.filter == "sauna"),
-    "decision": ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1),
-    "dropped": ("a filter", lambda c: c.filter != "none"),
-    "max_env_steps_factor": (
-        "a filter with dropped=replace",
-        lambda c: c.filter != "none" and c.dropped == "replace",
-    ),
-    "drop_rate": ("filter random-drop", lambda c: c.filter == "random-drop"),
-    "drop_rate_from": ("filter random-drop", lambda c: c.filter == "random-drop"),
-    "vex_target": ("vex_coef above 0", lambda c: c.vex_coef > 0),
-    "hidden": ("the mlp network", lambda c: c.network in ("auto", "mlp")),
-    "activation": ("the mlp network", lambda c: c.network in ("auto", "mlp")),
-    "env_timeout": ("env_processes above 0", lambda c: c.env_processes > 0),
-    "clip_observations": ("normalize_observations", lambda c: c.normalize_observations),
-    "clip_rewards": ("normalize_rewards", lambda c: c.normalize_rewards),
-}
-
-
-def check_read(configs: list[Config], given: Mapping[str, Any]) -> None:
-    """Refuses a given field that none of the arms' `configs` reads.
-
-    Raises:
-      BadInput: naming the field and what would read it.
-    """
-    for name in given:
-        if name in _READERS and not any(_READERS[name][1](config) for config in configs):
-            arms = ",".join(configs[0].arm)
-            raise BadInput(f"{name}: not read by arm {arms}; it needs {_READERS[name][0]}")
-
-
-def check_consistent(config: Config) -> None:
-    """Refuses values that are each possible but not together.
-
-    Raises:
-      BadInput: with the one line that says which.
-    """
-    if not config.env:
-        raise BadInput("env: no environment given; try `sauna train InvertedPendulum-v5`")
-    if not config.seeds:
-        raise BadInput("seeds: empty; give a number of seeds or a list")
-    if len(set(config.seeds)) != len(config.seeds):
-        raise BadInput("seeds: a seed is given twice")
-    if not config.hidden:
-        raise BadInput("hidden: empty; give at least one width")
-    if min(config.seeds) < 0 or max(config.seeds) >= 2**32:
-        raise BadInput("seeds: must lie between 0 and 2**32 - 1")
-    batch = config.rollout_steps * config.envs
-    if batch % config.minibatches:
-        raise BadInput(
-            f"minibatches: {config.minibatches} does not divide rollout_steps x envs = {batch}"
-        )
-    if config.steps < batch:
-        raise BadInput(f"steps: {config.steps} is less than one rollout of {batch} steps")
-    if config.gae_over == "kept" and config.truncation == "bootstrap":
-        raise BadInput(
-            "gae_over: kept needs truncation=terminate (the final value belongs to a step that "
-            "may have been dropped)"
-        )
-    if config.keep_rate_target and (config.history, config.decision) != ("all", "env"):
-        raise BadInput("keep_rate_target: needs history=all and decision=env")
-    if config.drop_rate and config.drop_rate_from:
-        raise BadInput("drop_rate: give either drop_rate or drop_rate_from, not both")
-    if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):
-        raise BadInput("drop_rate: random-drop needs a rate, or drop_rate_from=RUN")
-    if config.env_processes and "env" in local_parts(config):
-        raise BadInput(
-            "env_processes: the environment cannot be imported by another process; "
-            "put it at the top level of a module"
-        )
-    if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
-        raise BadInput("env_processes: more worker processes than environments")
-    for name in ("network", "vex_target", "filter"):
-        value = getattr(config, name)
-        if ":" in value:
-            import_name(name, value)
-
-
-def local_parts(config: Config) -> list[str]:
-    """The fields whose values were passed by value and only this process knows."""
-    return [name for name in FIELDS if is_local(str(getattr(config, name)))]
-
-
 def to_json(config: Config) -> dict[str, Any]:
-    """The config as JSON values, in field order."""
+    """Writes the config as JSON values, in field order."""
     values = dataclasses.asdict(config)
     values["env_kwargs"] = json.loads(config.env_kwargs)
     return {

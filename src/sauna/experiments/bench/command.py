@@ -29,12 +29,11 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
-_FIELDS = [*FIELDS]
 # The settings of environment and learning, which a trainer without filters has as well.
-_LEARNING = (
-    "env_kwargs",
-    "truncation",
-    *_FIELDS[_FIELDS.index("envs") : _FIELDS.index("clip_rewards") + 1],
+_LEARNING = tuple(
+    name
+    for name, field in FIELDS.items()
+    if field.metadata["group"] in ("task", "learning", "network", "normalisation") and name != "env"
 )
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 

@@ -16,13 +16,13 @@ from functools import partial
 from statistics import median
 from typing import Any
 
-from sauna.config.presets import members, plain, resolve
+from sauna.config.presets import plain, resolve, resolve_run
 from sauna.config.settings import Config
 from sauna.experiments.bench.rates import ratio
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
-from sauna.training.prepare import MOST_STEPS, look_at, placed, settle
+from sauna.training.prepare import MAX_STEPS, examine, place
 
 # Numbers of environments that `--scale` tries, and of members.
 ENVS = {"cpu": (8, 32, 128), "gpu": (256, 512, 1024, 2048, 4096, 8192, 16384)}
@@ -46,7 +46,7 @@ def bench_on_device(
       BadInput: the settings or the peer are not usable.
     """
     given = _given(given, 100 * iterations)
-    config = placed(resolve(given))
+    config = place(resolve_run(given)).config
     if against and against != "brax":
         raise BadInput(f"against: {against} has no environments on the device; brax has")
     if against:
@@ -113,9 +113,9 @@ def _given(given: Mapping[str, Any], iterations: int) -> dict[str, Any]:
     for name in ("processes", "distributed"):
         if name in given:
             raise BadInput(f"{name}: not read by a benchmark on the device, which is one process")
-    config = resolve({**given, "steps": MOST_STEPS})  # room for a rollout of any size
+    config = resolve({**given, "steps": MAX_STEPS})  # room for a rollout of any size
     steps = config.rollout_steps * config.envs * iterations
-    return {**given, "steps": min(steps, MOST_STEPS // config.max_env_steps_factor)}
+    return {**given, "steps": min(steps, MAX_STEPS // config.max_env_steps_factor)}
 
 
 def _told(round_: Mapping[str, float], name: str) -> str:
@@ -149,7 +149,7 @@ def scale_on_device(
     Raises:
       BadInput: the settings are not usable.
     """
-    config = placed(resolve(_given({**given, "seeds": 1}, 1)))
+    config = place(resolve_run(_given({**given, "seeds": 1}, 1))).config
     points = [("envs", n, {"envs": n, "seeds": 1}) for n in ENVS[config.device]]
     points += [("members", n, {"seeds": n}) for n in MEMBERS[config.device]]
     found: dict[str, dict[int, list[dict[str, float]]]] = {"envs": {}, "members": {}}
@@ -181,17 +181,15 @@ def scale_on_device(
 
 def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
     """One round, in this process."""
-    config = placed(resolve(given))
+    placed = place(resolve_run(given))
+    config = placed.config
     configure_jax(config.devices if config.device == "cpu" else 0, config.device)
     import jax
 
     from sauna.training.loop.device import make_population
-    from sauna.training.loop.job import Job
 
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    kwargs = json.loads(config.env_kwargs)
-    job = Job(config, found.spaces, kwargs, members(config, given), [], None, 0, True)
+    job = examine(placed, given).job()
+    config = job.config
     population = make_population(job)
     compile_seconds = population.compile()
     population.run(0, 1)
@@ -203,11 +201,11 @@ def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
 
 def _whole(population: Any, iterations: int) -> float:
     """Env steps per second of that many whole iterations, a device's call of them at a time."""
-    from sauna.training.loop.device_program import MOST_PER_CALL
+    from sauna.training.loop.device_program import MAX_PER_CALL
 
     first, steps, clock = 1, 0, time.perf_counter()
     while first <= iterations:
-        number = min(MOST_PER_CALL, iterations + 1 - first)
+        number = min(MAX_PER_CALL, iterations + 1 - first)
         reports = population.run(first, number)
         steps += sum(int(report.env_steps[report.ran].sum()) for report in reports)
         first += number
