@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from sauna.config.checks import check_consistent, check_read, is_read
+from sauna.config.other_names import key_hint
 from sauna.config.settings import FIELDS, Config, fields_with, parse
 from sauna.system.errors import BadInput, nearest
 
@@ -114,6 +115,7 @@ ARM_HELP = {
 
 # The arms of a comparison where none are named; the first is the baseline.
 COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+COMPARED_SEEDS = 6
 
 # What makes an arm what its name says; the user's own values do not apply to these.
 FIXED: dict[str, tuple[str, ...]] = {
@@ -191,7 +193,7 @@ def parse_all(overrides: Mapping[str, Any]) -> dict[str, Any]:
     """
     for name in overrides:
         if name not in FIELDS:
-            raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
+            raise BadInput(f"unknown key {name!r}{key_hint(name)}")
     return {name: parse(name, value) for name, value in overrides.items()}
 
 

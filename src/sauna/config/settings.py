@@ -76,7 +76,7 @@ class Config:
     )
     env_kwargs: str = _task("{}", "keyword arguments of the environment, as a JSON object")
     arm: tuple[str, ...] = _run(
-        ("sauna",), "what to train, a name or several: see `sauna list arms`", common=True
+        ("ppo",), "what to train, a name or several: see `sauna list arms`", common=True
     )
     algorithm: str = _run(
         "ppo",
@@ -86,7 +86,9 @@ class Config:
     )
     preset: str = _run("mujoco", "settings to start from; with A2C, preset a2c", common=True)
     seeds: tuple[int, ...] = _run(
-        (0,), "how many seeds (6: seeds 0 to 5), or which ones (100,101,110)", common=True
+        (0,),
+        "how many seeds (6: seeds 0 to 5; 42: 42 of them), or which ones (100,101,110)",
+        common=True,
     )
     steps: int = _run(
         1_000_000, "env steps per member", at_least=1, common=True, shapes_program=True
@@ -94,7 +96,7 @@ class Config:
 
     out: str = _run(
         "",
-        "run directory (default: runs/ENV_ARM_TIME)",
+        "run directory; none: runs/ENV_ARM_SEEDS_TIME",
         common=True,
         machine_local=True,
         decided_by_study=True,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna.config.checks import check_consistent, local_parts
+from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
 from sauna.config.stored import read_stored, to_stored
@@ -89,8 +90,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
     drop_rates = drop_rates_of(prepared.members)
     TensorBoard.check(prepared.config)
     check_own_parts(prepared)
-    config = prepared.config
-    path = Path(config.out) if config.out else run_directory.default_path(config.env, config.arm)
+    path, made = _make_directory(prepared.config)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
     stored = {
         **to_stored(prepared.run),
@@ -101,9 +101,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         "git": run_directory.git_revision(),
         "machine": run_directory.machine(),
     }
-    made = not path.exists()
     with disk_errors(path):
-        run_directory.create(path)
         run = Run(path, prepared, drop_rates, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
@@ -115,9 +113,26 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
     return run
 
 
+def _make_directory(config: Config) -> tuple[Path, bool]:
+    """Makes the run's directory; whether it was not there before.
+
+    Raises:
+      BadInput: it holds something already, or cannot be made.
+    """
+    if not config.out:
+        return run_directory.create_default(config.env, config.arm, config.seeds), True
+    path = Path(config.out)
+    made = not path.exists()
+    with disk_errors(path):
+        run_directory.create(path)
+    return path, made
+
+
 def _show_notes(prepared: Prepared, display: Display) -> None:
     """Says what a user may not expect of this run."""
     config = prepared.config
+    if note := many_seeds(config.seeds):
+        display.say(note)
     if prepared.differs:
         display.say(
             f"warning: {config.env} does not repeat itself ({prepared.differs}): this run can be "

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import algorithm_of, chosen_preset
+from sauna.config.presets import COMPARED_SEEDS, algorithm_of, chosen_preset
 from sauna.config.settings import Config
 from sauna.envs.probe import Probe
 from sauna.envs.spaces import Spaces
@@ -21,6 +21,7 @@ from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
+from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
 from sauna.experiments.study.summary import FILTERING, summarize
@@ -37,8 +38,6 @@ from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
 from sauna.training.prepare import examine, look_at, place
 
-SEEDS = 6  # of a comparison, where none are given
-
 
 def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
     """The study that `sauna compare ENV` runs: its folder is named after its settings.
@@ -52,7 +51,7 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     algorithm = algorithm_of(chosen_preset(settings))
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
     entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
-    values = {"tasks": [env], "arms": entries, "seeds": SEEDS, **rules, **settings}
+    values = {"tasks": [env], "arms": entries, "seeds": COMPARED_SEEDS, **rules, **settings}
     spec = read_spec({"name": "compare", **values})
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
     name = f"compare_{place}_{digest_of(study_identity(spec))}"
@@ -187,6 +186,8 @@ def _train(
             f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
             f"writing to {place}"
         )
+        for note in before_training(spec):
+            view.say(note)
         noted: list[int] = []
         with handled(partial(_note_signal, noted)):
             view.open()

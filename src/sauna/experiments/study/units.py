@@ -102,7 +102,8 @@ def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> 
 
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
     """What of a run's config differs from the defaults: the same for the same training."""
-    config, usual = to_json(check(arm._replace(seeds=seeds), task)), to_json(Config())
+    config = to_json(check(arm._replace(seeds=seeds), task))
+    usual = {**to_json(Config()), "arm": ["sauna"]}  # its default when units got their names
     return {name: value for name, value in config.items() if value != usual[name]}
 
 
