@@ -63,7 +63,7 @@ class Recorder:
 
 
 def make_job(env: str, chosen: list[int] | None = None, **settings: Any) -> Job:
-    overrides = {"env": env, "processes": 1, **SMALL, **settings}
+    overrides = {"env": env, "arm": "sauna", "processes": 1, **SMALL, **settings}
     if "network" in settings:
         del overrides["hidden"]  # which only the MLP reads
     if settings.get("algorithm") == "a2c":

@@ -47,7 +47,7 @@ def test_resuming_a_complete_run_does_nothing(tmp_path: Path, capsys) -> None:
 
 def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, capsys) -> None:
     run = tmp_path / "run"
-    sauna.train("worlds:Forgetful", out=run, **SMALL)
+    sauna.train("worlds:Forgetful", out=run, arm="sauna", **SMALL)
     said = capsys.readouterr().out
     assert "does not repeat itself" in said and "not resumed exactly" in said
     assert said.index("does not repeat") < said.index("writing to")
@@ -84,7 +84,12 @@ def make_incomplete(run: Path, iteration: int) -> None:
 def finished(tmp_path: Path, **settings) -> Path:
     run = tmp_path / "run"
     sauna.train(
-        WORLD, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9, **{**SMALL, **settings}
+        WORLD,
+        out=run,
+        quiet=True,
+        checkpoint_every=2,
+        keep_checkpoints=9,
+        **{**SMALL, "arm": "sauna", **settings},
     )
     return run
 
@@ -164,7 +169,8 @@ def test_what_a_worker_finds_unusable_is_bad_input_and_leaves_nothing(
 
 def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) -> None:
     run = tmp_path / "run"
-    sauna.train(lambda: Scripted(), out=run, checkpoint_every=2, keep_checkpoints=9, **SMALL)
+    more = {"arm": "sauna", "checkpoint_every": 2, "keep_checkpoints": 9}
+    sauna.train(lambda: Scripted(), out=run, **more, **SMALL)
     assert "can be resumed only from Python" in capsys.readouterr().out
     expected = (run / "metrics.jsonl").read_bytes()
     make_incomplete(run, 2)
