@@ -17,6 +17,7 @@ from faults.canned import BACKENDS, Trap, played_back, record, trained_here, unt
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
+from sauna.config import presets
 from sauna.config.settings import FIELDS, TYPES, fields_with
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.system import checkpoint, run_directory
@@ -179,6 +180,22 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()
     assert rows[:kept] == old[:kept] and len(run_directory.rows(run)) == 6
+
+
+def test_an_old_run_ends_alike_under_other_presets(tmp_path: Path, monkeypatch) -> None:
+    """What 0.1.0 stored is enough: nothing is taken from the presets, arms or defaults of today."""
+    ended = []
+    for name in ("first", "second"):
+        shutil.copytree(GOLDEN / "format-1-host", tmp_path / name)
+        with trained_here():
+            sauna.resume(tmp_path / name, quiet=True)
+        newest = checkpoint.load_newest(tmp_path / name / "checkpoints", print)
+        assert newest is not None and newest.manifest["arms"] == {"ppo": {}}
+        ended.append((newest.manifest["sha256"], (tmp_path / name / "metrics.jsonl").read_bytes()))
+        other = {"learning_rate": 0.1, "gamma": 0.5, "vex_coef": 0.9}
+        monkeypatch.setitem(presets.PRESETS, "mujoco", other)
+        monkeypatch.setitem(presets.ARMS, "ppo", {"filter": "sauna", "vex_coef": 0.2})
+    assert ended[0] == ended[1]
 
 
 def test_other_versions_of_the_libraries_are_told(tmp_path: Path, capsys, monkeypatch) -> None:

@@ -11,7 +11,7 @@ from sauna.system.errors import BadInput
 
 
 def is_read(name: str, config: Config) -> bool:
-    """Whether a run with this config reads field `name`."""
+    """Returns whether a run with this config reads field `name`."""
     read_when = FIELDS[name].metadata["read_when"]
     return read_when is None or bool(read_when[1](config))
 

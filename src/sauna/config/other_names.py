@@ -83,7 +83,7 @@ ADVICE = {
     "max_iterations": "give steps: iterations x envs x rollout_steps",
     "num_iterations": "give steps: iterations x envs x rollout_steps",
     "capture_video": "`sauna eval RUN --video` films a trained policy",
-    "torch_deterministic": "a run repeats itself to the bit without being told",
+    "torch_deterministic": "a run repeats itself to the bit by itself",
     "verbose": "`quiet=True` in Python shows nothing",
     "use_sde": "there is no state-dependent exploration here",
     "policy": "the policy follows from the spaces; `network` chooses its trunk",

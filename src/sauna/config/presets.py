@@ -147,7 +147,7 @@ class RunConfig(NamedTuple):
 
     @property
     def members(self) -> list[Member]:
-        """All members, arm by arm and seed by seed; each with its own arm's config."""
+        """Lists all members, arm by arm and seed by seed; each with its own arm's config."""
         return [
             Member(f"{arm}/{seed}", arm, seed, self.arms[arm])
             for arm in self.config.arm

@@ -86,7 +86,7 @@ class ThreadProcess:
         return 0
 
     def kill(self) -> None:
-        """A thread cannot be killed; its closed inbox ends it at its next iteration."""
+        """Does nothing: its closed inbox ends a thread at its next iteration."""
 
 
 class Worker(NamedTuple):

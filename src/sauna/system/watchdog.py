@@ -48,6 +48,7 @@ class Watchdog:
         self._silent[number] = 0.0
 
     def close(self) -> None:
+        """Ends the thread."""
         self._closed.set()
 
     def _run(self) -> None:

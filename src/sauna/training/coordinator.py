@@ -102,6 +102,12 @@ class Coordinator:
         self._display.close()
 
     def run(self) -> None:
+        """Trains to the end, or to where a signal stops it.
+
+        Raises:
+          Interrupted: a signal came; the state is saved.
+          SaunaError: something failed; the last good checkpoint is on disk.
+        """
         run = self._run
         self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
@@ -122,7 +128,7 @@ class Coordinator:
         return max(end for end in self._ended if end is not None)
 
     def _on_signal(self, number: int) -> None:
-        """Only notes the first signal: it may come in the middle of anything."""
+        """Notes the first signal, and no more: it may come in the middle of anything."""
         if self._signal is not None:
             raise Interrupted(
                 number, f"stopped at once; continue with: {resume_command(self._run.path)}"
@@ -221,7 +227,7 @@ class Coordinator:
             self._save(*self._due.pop(0))
 
     def _complete(self, iteration: int, messages: Mapping[int, Message]) -> bool:
-        """Whether every process that runs this iteration has reported it."""
+        """Returns whether every process that runs this iteration has reported it."""
         return bool(messages) and all(
             number in messages or (end is not None and end <= iteration)
             for number, end in enumerate(self._ended)
@@ -234,7 +240,7 @@ class Coordinator:
         )
 
     def _save(self, iteration: int, logs: dict[str, int]) -> None:
-        """A checkpoint of all members at (the start of) an iteration, or at their end before it."""
+        """Saves all members at (the start of) an iteration, or at their end before it."""
         arrays: dict[str, np.ndarray] = {}
         for states in self._states:
             arrays |= states[iteration if iteration in states else max(states)]
@@ -289,12 +295,12 @@ class Coordinator:
 
 
 def lead_for(seconds: float) -> int:
-    """Iterations to grant where one takes `seconds`: a call to the device runs many short ones."""
+    """Counts the iterations to grant if one takes `seconds`: the device runs many in a call."""
     return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MAX_LEAD))
 
 
 def _environment(config: Config) -> dict[str, str]:
-    """What a worker's JAX has to know before it is imported."""
+    """Lists what a worker's JAX has to know before it is imported."""
     if config.backend == "device" and config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
     return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}

@@ -42,10 +42,12 @@ class Prepared(NamedTuple):
 
     @property
     def config(self) -> Config:
+        """What all members share."""
         return self.run.config
 
     @property
     def members(self) -> list[Member]:
+        """What is trained, arm by arm and seed by seed."""
         return self.run.members
 
     def job(self, chosen: Sequence[int] | None = None, **more: Any) -> Job:
@@ -104,7 +106,7 @@ def place(run: RunConfig) -> RunConfig:
 
 
 def has_gpu() -> bool:
-    """Whether there is an NVIDIA GPU and a JAX that may use it; found without importing JAX."""
+    """Finds, without importing JAX, whether there is an NVIDIA GPU that JAX may use."""
     drivers = ("/proc/driver/nvidia/version", "/usr/lib/wsl/lib/libcuda.so.1")
     plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")
@@ -165,7 +167,7 @@ def check_writes(config: Config) -> None:
 
 
 def _together(config: Config) -> bool:
-    """Whether one program trains all members, on a GPU or on several devices."""
+    """Returns whether one program trains all members, on a GPU or on several devices."""
     several = config.device == "gpu" or config.devices > 1 or bool(config.distributed)
     return config.backend == "device" and several
 
@@ -214,7 +216,7 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
 
 
 def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
-    """Per member, the drop rate that the run it repeats had in every iteration.
+    """Reads, per member, the drop rate that the run it repeats had in every iteration.
 
     Raises:
       BadInput: that run is not complete, lacks a seed, is not of exactly one filtered arm, or has

@@ -53,18 +53,22 @@ class Run:
 
     @property
     def config(self) -> Config:
+        """What all members share."""
         return self.prepared.config
 
     @property
     def members(self) -> list[Member]:
+        """What is trained, arm by arm and seed by seed."""
         return self.prepared.members
 
     @property
     def spaces(self) -> Spaces:
+        """Of the environment."""
         return self.prepared.spaces
 
     @property
     def differs(self) -> str | None:
+        """How two equal episodes differed; None if the environment repeats itself."""
         return self.prepared.differs
 
     def manifest(self) -> dict[str, Any]:
@@ -114,7 +118,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
 
 
 def _make_directory(config: Config) -> tuple[Path, bool]:
-    """Makes the run's directory; whether it was not there before.
+    """Makes the run's directory; returns it and whether it is new.
 
     Raises:
       BadInput: it holds something already, or cannot be made.
@@ -146,7 +150,7 @@ def _show_notes(prepared: Prepared, display: Display) -> None:
 
 
 def follows(overrides: Mapping[str, Any]) -> bool:
-    """Whether another machine writes this run.
+    """Returns whether another machine writes this run.
 
     Raises:
       BadInput: `distributed` cannot be read.

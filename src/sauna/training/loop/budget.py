@@ -15,7 +15,7 @@ from sauna.training.loop.member_state import Counters
 
 
 def budget_left(config: Config, counters: Counters) -> bool:
-    """Whether a whole rollout still fits in the budget: a run never oversteps it."""
+    """Returns whether a whole rollout still fits in the budget: a run never oversteps it."""
     used = counters.kept_steps if config.budget == "kept" else counters.env_steps
     return config.steps - used >= config.rollout_steps * config.envs
 

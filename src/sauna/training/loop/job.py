@@ -24,16 +24,19 @@ class NonFinite(SaunaError):
 class Reporter(Protocol):
     """Where the loop's messages go, and where its permissions come from."""
 
-    def phase(self, text: str) -> None: ...
+    def phase(self, text: str) -> None:
+        """Reports what is done now."""
 
     def allowance(self, iteration: int) -> int:
-        """Waits until iteration `iteration` may start; how many may from there on. 0: stop."""
+        """Waits until `iteration` may start; returns how many may from there on. 0: stop."""
 
     def iteration(
         self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
-    ) -> None: ...
+    ) -> None:
+        """Reports a finished iteration."""
 
-    def state(self, iteration: int, arrays: Arrays) -> None: ...
+    def state(self, iteration: int, arrays: Arrays) -> None:
+        """Reports the state of all members at the start of an iteration."""
 
 
 class Job(NamedTuple):

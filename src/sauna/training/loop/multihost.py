@@ -72,7 +72,7 @@ def broadcast(host: HostRank, number: int) -> int:
 
 
 def all_equal(host: HostRank, text: str) -> bool:
-    """Whether all machines have the same text."""
+    """Returns whether all machines have the same text."""
     if host.hosts == 1:
         return True
     from jax.experimental.multihost_utils import process_allgather
