@@ -22,11 +22,13 @@ from sauna.config.presets import (
     ARM_HELP,
     COMPARED,
     COMPARED_SEEDS,
+    FILTER_HELP,
     PRESET_HELP,
+    TARGET_HELP,
     overrides_of,
     parse_all,
 )
-from sauna.config.settings import FIELDS, FILTERS, NATIVE, VEX_TARGETS, fields_with, flag
+from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 
@@ -413,29 +415,6 @@ def _list(values: dict[str, Any]) -> None:
             print(f"{name:{width}}  {text}")
 
 
-FILTER_HELP = dict(
-    zip(
-        FILTERS,
-        (
-            "keep everything",
-            "keep where |Vex| / |median of earlier Vex| reaches the threshold (eq. 7)",
-            "drop at random at a given rate",
-        ),
-        strict=True,
-    )
-)
-TARGET_HELP = dict(
-    zip(
-        VEX_TARGETS,
-        (
-            "eq. 5 over one actor's rollout, one number for all its states (the paper)",
-            "1 - Var(R - V) / Var(R) over each minibatch (the released code)",
-            "eq. 5 over each stretch of one episode",
-            "each state's own share of eq. 5",
-        ),
-        strict=True,
-    )
-)
 _COMMANDS = {
     "train": _train,
     "resume": _resume,

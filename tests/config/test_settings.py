@@ -6,9 +6,10 @@ import dataclasses
 
 import pytest
 
+from sauna.config import presets
 from sauna.config.checks import check_read, check_read_here, is_read
 from sauna.config.fields import GROUPS
-from sauna.config.settings import FIELDS, Config, fields_with
+from sauna.config.settings import FIELDS, FILTERS, VEX_TARGETS, Config, fields_with
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
 
@@ -60,3 +61,9 @@ def test_what_place_and_spaces_leave_unread() -> None:
 
 def test_what_resume_may_change_shapes_no_program() -> None:
     assert not set(fields_with("resumable")) & set(fields_with("shapes_program"))
+
+
+def test_every_choice_that_has_a_name_has_a_help_line() -> None:
+    assert set(presets.FILTER_HELP) == set(FILTERS) and set(presets.TARGET_HELP) == set(VEX_TARGETS)
+    assert set(presets.ARM_HELP) == set(presets.ARMS)
+    assert set(presets.PRESET_HELP) == set(presets.PRESETS)

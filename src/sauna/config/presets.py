@@ -113,6 +113,18 @@ ARM_HELP = {
     "sauna-reference": "the method as the authors' released code does it, quirks included",
 }
 
+FILTER_HELP = {
+    "none": "keep everything",
+    "sauna": "keep where |Vex| / |median of earlier Vex| reaches the threshold (eq. 7)",
+    "random-drop": "drop at random at a given rate",
+}
+TARGET_HELP = {
+    "rollout": "eq. 5 over one actor's rollout, one number for all its states (the paper)",
+    "minibatch": "1 - Var(R - V) / Var(R) over each minibatch (the released code)",
+    "episode": "eq. 5 over each segment of one episode",
+    "sample": "each state's own share of eq. 5",
+}
+
 # The arms of a comparison where none are named; the first is the baseline.
 COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
 COMPARED_SEEDS = 6
