@@ -328,39 +328,40 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
 def _bench(values: dict[str, Any]) -> None:
     import json
 
-    fixed = ("iterations", "seeds", "processes", "envs", "rollout_steps", "hidden")
+    scale = values.pop("scale")
+    fixed = ("iterations", "seed", "seeds", "processes", "envs", "rollout_steps", "hidden")
     unread = [name for name in fixed if name in values] + ["against"] * bool(values["against"])
-    if values["scale"] and unread:
+    if scale and unread:
         raise BadInput(f"{unread[0]}: not read with --scale")
     values.setdefault("iterations", "50")
     rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 2)
     against, file = values.pop("against"), values.pop("json")
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")
-    given = {"arm": "ppo", "seeds": 6, **values}
     script = values["script"]
     if (against == "cleanrl") != bool(script) or (script and not Path(script).is_file()):
         raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
-    for name in ("rounds", "iterations", "scale", "script"):
-        del given[name]
+    for name in ("rounds", "iterations", "script"):
+        del values[name]
+    overrides = {"seeds": 6, **translate({"arm": "ppo", **values})}
     from sauna.config.presets import plain, resolve_run
     from sauna.experiments.bench.command import bench, bench_scale, report
     from sauna.experiments.bench.device import bench_on_device, report_on_device, scale_on_device
     from sauna.training.prepare import place
 
-    native = place(resolve_run(plain(given))).config.backend == "device"
-    if native and values["scale"]:
-        result = scale_on_device(given, rounds, iterations, _say)
+    native = place(resolve_run(plain(overrides))).config.backend == "device"
+    if native and scale:
+        result = scale_on_device(overrides, rounds, iterations, _say)
     elif native:
         result = bench_on_device(
-            given, rounds=rounds, iterations=iterations, against=against, say=_say
+            overrides, rounds=rounds, iterations=iterations, against=against, say=_say
         )
         print("\n".join(report_on_device(result)))
-    elif values["scale"]:
-        result = bench_scale(given, rounds, _say)
+    elif scale:
+        result = bench_scale(overrides, rounds, _say)
     else:
         result = bench(
-            given,
+            overrides,
             rounds=rounds,
             iterations=iterations,
             against=against,

@@ -95,9 +95,9 @@ def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, 
         reader.add_argument(name)
     try:
         named, _ = reader.parse_known_args(list(arguments))
-        given = {n: v for n, v in vars(named).items() if v is not None and n != "arm"}
+        preset = {n: v for n, v in vars(named).items() if v is not None and n != "arm"}
         first = arm or str(named.arm or Config.arm[0]).split(",")[0]
-        config = arm_config(first if first in ARMS else Config.arm[0], given)
+        config = arm_config(first if first in ARMS else Config.arm[0], preset)
     except (argparse.ArgumentError, BadInput):
         config = Config()
     return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}

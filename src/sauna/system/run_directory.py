@@ -169,7 +169,7 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def read_config_file(path: Path) -> dict[str, Any]:
-    """A file as `config.json` is: `config` and `given`, or plain settings.
+    """Reads a file as `config.json` is: `config` and `arms`, or plain settings.
 
     Raises:
       BadInput: the file cannot be read as that.

@@ -19,8 +19,8 @@ from sauna.training.prepare import place
 EPOCHS = 4  # the first holds the compilation
 
 
-def rate(given: dict[str, Any], iterations: int) -> float:
-    config = place(resolve_run(given)).config
+def rate(overrides: dict[str, Any], iterations: int) -> float:
+    config = place(resolve_run(overrides)).config
     configure_jax(0, config.device)
     import jax
 
