@@ -53,7 +53,7 @@ BAD = [
     (["train", "worlds:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
     (["train", "worlds:Picture", "--hidden", "8"], "hidden: not read"),
     (["train", WORLD, "--seeds", "123456"], "for the one seed 123456 write --seed 123456"),
-    (["train", WORLD, "--arm", "sauna", "--filter", "worlds:Scripted"], "is not a sauna.Filter"),
+    (["train", WORLD, "--arm", "sauna", "--filter", "worlds:Scripted"], "not a sauna.StepFilter"),
     (
         ["train", WORLD, "--arm", "sauna", "--vex-target", "worlds:Scripted"],
         "is not a sauna.VexTarget",
@@ -85,7 +85,7 @@ BAD = [
     (["train", WORLD, "--num_envs=4"], "here it is '--envs': environments per member"),
     (["train", WORLD, "--lr", "1e-3"], "here it is '--learning-rate'"),
     (["train", WORLD, "--total-timesteps", "1e6"], "here it is '--steps'"),
-    (["train", WORLD, "--target-kl", "0.01"], "no early stopping by KL divergence"),
+    (["train", WORLD, "--target-kl", "0.01"], "`--stop target-kl` stops an iteration"),
     (["train", WORLD, "--batch-size", "100"], "batch_size: 100 does not divide"),
     (["train", WORLD, "--batch-size", "0"], "batch_size: 0 does not divide"),
     (["train", WORLD, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),

@@ -103,7 +103,8 @@ def test_unfiltered_arms_take_the_rules_of_the_filtered_one() -> None:
 
 
 def test_arms_of_other_programs_are_refused() -> None:
-    for arms in ("sauna,random-drop", "sauna,sauna-reference", "sauna,sauna-paper"):
+    refused = ("sauna,random-drop", "sauna,sauna-reference", "sauna,sauna-paper")
+    for arms in (*refused, "ppo,gigaflow", "gigaflow,ppo", "ppo,avec", "ppo,sauna+avec"):
         with pytest.raises(BadInput, match="shapes the compiled program"):
             resolve(
                 {"env": "x", "arm": arms, "drop_rate": 0.1}

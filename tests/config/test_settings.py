@@ -34,6 +34,7 @@ def test_a_field_that_nothing_reads_is_refused_with_what_would_read_it(name: str
         vex_coef=0.0,
         normalize_observations=False,
         normalize_rewards=False,
+        normalize_advantages=False,
     )
     needed = FIELDS[name].metadata["read_when"][0]
     assert not is_read(name, unread)
@@ -64,6 +65,7 @@ def test_what_resume_may_change_shapes_no_program() -> None:
 
 
 def test_every_choice_that_has_a_name_has_a_help_line() -> None:
+    assert set(presets.CONTROL_HELP) == set(presets.CONTROLS)
     assert set(presets.FILTER_HELP) == set(FILTERS) and set(presets.TARGET_HELP) == set(VEX_TARGETS)
     assert set(presets.ARM_HELP) == set(presets.ARMS)
     assert set(presets.PRESET_HELP) == set(presets.PRESETS)

@@ -90,8 +90,44 @@ def check_consistent(config: Config) -> None:
         )
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
+    check_rules(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
+
+
+def check_rules(config: Config) -> None:
+    """Refuses rules of selection that cannot work together.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    stages = [
+        name for name in ("filter", "sampler", "loss_weight") if getattr(config, name) != "none"
+    ]
+    if config.control != "none":
+        if not stages:
+            raise BadInput("control: needs a rule to follow: a filter, a sampler or a loss_weight")
+        if len(stages) > 1:
+            raise BadInput(f"control: {' and '.join(stages)} are two rules; it can follow one")
+        if stages == ["loss_weight"] and config.control not in ("random", "reversed"):
+            raise BadInput(
+                f"control: a loss_weight is controlled by random or reversed, not by "
+                f"{config.control}"
+            )
+        if config.filter == "random-drop":
+            raise BadInput("control: random-drop is a control itself")
+    if config.gae_over == "kept":
+        unfit = [("control", "none"), ("critic", "squared"), ("recompute_advantages", False)]
+        for name, plain in unfit:
+            if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
+                raise BadInput(f"{name}: needs gae_over=all")
+    if config.algorithm == "a2c" and config.stop != "none":
+        raise BadInput("stop: A2C makes one pass, which nothing stops early")
+    if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
+        raise BadInput(
+            "objective: unclipped needs a stop rule (espo) or a loss_weight "
+            "(sample-dropout): nothing else bounds the ratio"
+        )
 
 
 def local_parts(config: Config) -> list[str]:

@@ -11,7 +11,16 @@ from collections.abc import Callable
 from typing import Any
 
 # The groups of `--help`, in its order.
-GROUPS = ("task", "run", "where it runs", "learning", "network", "normalisation", "selection")
+GROUPS = (
+    "task",
+    "run",
+    "where it runs",
+    "learning",
+    "network",
+    "normalisation",
+    "selection",
+    "update rules",
+)
 
 
 def option(

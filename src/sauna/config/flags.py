@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sauna.config.fields import GROUPS
-from sauna.config.presets import ARMS, arm_config
+from sauna.config.presets import arm_config
 from sauna.config.settings import FIELDS, TYPES, Config, flag
 from sauna.system.errors import BadInput
 
@@ -73,7 +73,7 @@ def _add_accepted(group: Any, chosen: list[str]) -> None:
 def metavar(name: str) -> str:
     """Writes a field's type for the help: INT, FLOAT, INT,..., TEXT, or its choices."""
     meta, field_type = FIELDS[name].metadata, TYPES[name]
-    if name == "env_kwargs":
+    if name.endswith("_kwargs"):
         return "JSON"
     if meta["choices"]:
         return "|".join((*meta["choices"], *(["MODULE:NAME"] if meta["plugin"] else [])))
@@ -97,7 +97,7 @@ def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, 
         named, _ = reader.parse_known_args(list(arguments))
         preset = {n: v for n, v in vars(named).items() if v is not None and n != "arm"}
         first = arm or str(named.arm or Config.arm[0]).split(",")[0]
-        config = arm_config(first if first in ARMS else Config.arm[0], preset)
+        config = arm_config(first, preset)
     except (argparse.ArgumentError, BadInput):
         config = Config()
     return {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}

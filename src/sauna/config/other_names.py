@@ -78,7 +78,7 @@ SAME = {
     "n_seeds": "seeds",
 }
 ADVICE = {
-    "target_kl": "there is no early stopping by KL divergence here; epochs and clip_range bound it",
+    "target_kl": "`--stop target-kl` stops an iteration by its KL divergence",
     "desired_kl": "there is no step size by KL divergence here; see learning_rate_schedule",
     "max_iterations": "give steps: iterations x envs x rollout_steps",
     "num_iterations": "give steps: iterations x envs x rollout_steps",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sauna.config.checks import check_read, check_read_here, local_parts, own_parts
-from sauna.config.presets import ARMS, Member, RunConfig, parse_all, resolve_run
+from sauna.config.presets import Member, RunConfig, arm_settings, parse_all, resolve_run
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
@@ -226,7 +226,7 @@ def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
     if not source:
         return []
     arms = run_directory.read_config(Path(source))["config"]["arm"]
-    filtered = [arm for arm in arms if ARMS[arm]["filter"] != "none"]
+    filtered = [arm for arm in arms if arm_settings(arm)["filter"] != "none"]
     if len(filtered) != 1:
         raise BadInput(f"drop_rate_from: {source} has {len(filtered)} filtered arms; it needs one")
     if not run_directory.is_complete(Path(source)):
