@@ -1,6 +1,6 @@
 """The run directory: what is in it, who may write to it, and how its logs are cut back.
 
-config.json     every resolved value, versions, git revision, machine
+config.json     the settings and what each arm differs in, versions, git revision, machine
 metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
 summary.json    how each member ended
