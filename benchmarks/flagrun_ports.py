@@ -1,6 +1,6 @@
 """This project's HumanoidFlagrunHarder beside the Bullet port's: what they show, pay and end.
 
-python benchmarks/flagrun_ports.py            the tables of docs/reference/flagrun.md from the result file
+python benchmarks/flagrun_ports.py            the tables of the page from the result file
 python benchmarks/flagrun_ports.py --measure  measures first (a quarter of an hour), which needs
                                               `pip install pybullet-envs-gymnasium`
 python benchmarks/flagrun_ports.py --stills   draws the pictures of docs/reference/flagrun.md

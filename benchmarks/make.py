@@ -191,7 +191,11 @@ def main() -> None:
     if scaled.exists():
         result = json.loads(scaled.read_text())
         insert(page, "scale", scale_table(result))
-        draw(result["scale"], f"{result['env']}, PPO, whole training", ROOT / "docs" / "images" / "scale.png")
+        draw(
+            result["scale"],
+            f"{result['env']}, PPO, whole training",
+            ROOT / "docs" / "images" / "scale.png",
+        )
 
 
 if __name__ == "__main__":

@@ -29,7 +29,11 @@ ROOT = Path(__file__).parent.parent
 def result(tmp_path_factory):
     run = tmp_path_factory.mktemp("api") / "run"
     return sauna.train(
-        "worlds:Scripted", quiet=True, out=run, tensorboard=True, **{**SMALL, "seeds": 2}
+        "worlds:Scripted",
+        quiet=True,
+        out=run,
+        tensorboard=True,
+        **{**SMALL, "arm": "sauna", "seeds": 2},
     )
 
 
@@ -176,7 +180,7 @@ def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_pa
         out=tmp_path / "run",
         env_processes=2,
         processes=1,
-        **{**SMALL, "seeds": 2},
+        **{**SMALL, "arm": "sauna", "seeds": 2},
     )
     assert other.metrics == result.metrics
 
@@ -222,7 +226,12 @@ def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
     (tmp_path / "my_targets.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     run = sauna.train(
-        "worlds:Scripted", quiet=True, out=tmp_path / "run", vex_target="my_targets:sign", **SMALL
+        "worlds:Scripted",
+        quiet=True,
+        out=tmp_path / "run",
+        arm="vex-head",
+        vex_target="my_targets:sign",
+        **SMALL,
     )
     assert all(0 <= row["vex_target"] <= 1 for row in run.metrics)
 
@@ -266,7 +275,7 @@ def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
     shown = display.make_display()
     assert isinstance(shown, display.LiveDisplay)
     sauna_run = sauna.api.runs.start(
-        {"env": "worlds:Finite", "out": str(tmp_path / "run"), **SMALL}, shown
+        {"env": "worlds:Finite", "arm": "sauna", "out": str(tmp_path / "run"), **SMALL}, shown
     )
     sauna.api.train_and_draw(sauna_run, shown, resume=False)
     text = capsys.readouterr().out

@@ -4,7 +4,7 @@
     python tests/faults/campaign.py --row 2 --row 9 these rows only
     python tests/faults/campaign.py --again         also what is there already
     python tests/faults/campaign.py --scale small   what `make test` tries; nothing is stored
-    python tests/faults/campaign.py --docs          docs/concepts/reliability.md from the file, no trials
+    python tests/faults/campaign.py --docs          the tables of the page on reliability
 
 A row is kept as long as the sources that it was measured with are the same.
 """
