@@ -119,5 +119,5 @@ def _flat(tree: Any) -> tuple[list[Any], Any]:
 
 
 def may_become(before: Any, after: Any) -> bool:
-    """Whether a loop may carry both; a Python number takes the type that it is used with."""
+    """Returns whether a loop may carry both; a Python number takes the type of its use."""
     return before.shape == after.shape and (before.dtype == after.dtype or before.weak_type)

@@ -24,7 +24,7 @@ from sauna.config.presets import Member
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
-from sauna.training.loop.budget import goes_on, hypers_of, step_limit
+from sauna.training.loop.budget import budget_left, hypers_of, step_limit
 from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
 from sauna.training.loop.member_state import Counters, pack_member, unpack_member
 from sauna.training.loop.metrics import metrics_row
@@ -49,7 +49,7 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
         states, counters = _start(job, program, learner, keys, collector, envs)
         reporter.phase("compiling")
         iteration = job.start
-        while any(goes_on(config, c) for c in counters) and reporter.allowance(iteration):
+        while any(budget_left(config, c) for c in counters) and reporter.allowance(iteration):
             clock, cpu = time.perf_counter(), time.process_time()
             hypers = [hypers_of(job, p, counters[p], iteration) for p in range(len(members))]
             limit = np.array([step_limit(config, c) for c in counters])
