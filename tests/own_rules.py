@@ -5,7 +5,29 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sauna import Choice, LossTerms, LossWeight, Sampler, SamplerSetup, Samples, StopRule
+from sauna import (
+    Choice,
+    Hypers,
+    LossTerms,
+    LossWeight,
+    Sampler,
+    SamplerSetup,
+    Samples,
+    ScoredStep,
+    StepFilter,
+    StopRule,
+)
+
+
+def likely(least: float = -3.0) -> StepFilter:
+    """Keeps the steps whose action was not too unlikely."""
+
+    def keep(
+        state: tuple[()], step: ScoredStep, key: jax.Array, hypers: Hypers
+    ) -> tuple[tuple[()], jax.Array]:
+        return state, step.log_prob >= least
+
+    return StepFilter(lambda num_envs, capacity: (), keep)
 
 
 def newest(setup: SamplerSetup, share: float = 0.5) -> Sampler:

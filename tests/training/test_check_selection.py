@@ -11,6 +11,7 @@ import pytest
 
 import sauna
 from helpers import SMALL, configured, environment
+from sauna.algorithm.selection.registry import make_filter
 from sauna.config.presets import resolve
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
@@ -29,6 +30,8 @@ def of(**settings: Any) -> Config:
 @pytest.mark.parametrize("spaces", [SPACES, BITS])
 def test_rules_that_fit_are_taken(spaces: Spaces) -> None:
     for settings in (
+        {"arm": "sauna", "filter": "own_rules:likely"},
+        {"arm": "sauna", "filter": "own_rules:likely", "filter_kwargs": '{"least": -2}'},
         {"sampler": "own_rules:newest", "sampler_kwargs": '{"share": 0.25}'},
         {"sampler": "own_rules:newest", "control": "reversed"},
         {"sampler": "own_rules:scoreless", "control": "stride"},
@@ -39,6 +42,11 @@ def test_rules_that_fit_are_taken(spaces: Spaces) -> None:
 
 
 REFUSED = [
+    (
+        {"arm": "sauna", "filter": "own_rules:likely", "filter_kwargs": '{"most": -2}'},
+        "filter_kwargs: own_rules:likely cannot be made: likely() got an unexpected",
+    ),
+    ({"arm": "sauna", "filter": "own_rules:far"}, "filter: own_rules:far is not a sauna.StepF"),
     ({"sampler": "own_rules:no_rule"}, "sampler: own_rules:no_rule is not a sauna.Sampler"),
     ({"sampler": "own_rules:too_short"}, "keep of shape (15,) and type bool instead of (16,)"),
     ({"sampler": "own_rules:by_number"}, "and type float32 instead of (16,) and bool"),
@@ -152,6 +160,7 @@ MISTAKEN = [
     ({"objective": "unclipped"}, "unclipped needs a stop rule"),
     ({"algorithm": "a2c", "stop": "espo"}, "stop: not read"),
     ({"sampler_kwargs": "{}"}, "sampler_kwargs: not read"),
+    ({"arm": "sauna", "filter_kwargs": "{}"}, "needs a filter of your own"),
     ({"arm": "random"}, "follows a rule; join it to one"),
     ({"arm": "gigaflow+pods"}, "joins sampler gigaflow and sampler pods"),
     ({"arm": "gigafow"}, "did you mean 'gigaflow'"),
@@ -165,6 +174,16 @@ def test_rules_that_cannot_work_together_are_refused(settings: dict[str, Any], t
     with pytest.raises(BadInput) as found:
         resolve({"env": "worlds:Scripted", "arm": "ppo", **settings})
     assert text in str(found.value)
+
+
+def test_an_own_filters_arguments_matter() -> None:
+    """A step of log-probability -2.5 is kept or dropped."""
+    settings = {"arm": "sauna", "filter": "own_rules:likely"}
+    zero = np.zeros(1, np.float32)
+    step = sauna.ScoredStep(zero, zero, np.full(1, -2.5, np.float32), zero, zero)
+    for least, kept in ((-3.0, True), (-2.0, False)):
+        own = make_filter(of(**settings, filter_kwargs={"least": least}))
+        assert own is not None and own.keep((), step, None, None)[1].tolist() == [kept]  # type: ignore[arg-type]
 
 
 OFF = {
