@@ -351,9 +351,10 @@ def test_delight_on_the_mean_leaves_the_log_std_its_gradient(on: Any) -> None:
         )
         return losses.policy_loss
 
-    gradient = -10 * np.asarray(
-        jax.jit(jax.grad(lambda p: policy_loss(p, delight(on=on))))(parameters)
-    )
+    def gradient_of(rule: Any) -> np.ndarray:
+        return -10 * np.asarray(jax.jit(jax.grad(lambda p: policy_loss(p, rule)))(parameters))
+
+    gradient = gradient_of(delight(on=on))
     entropy = np.asarray(distribution.entropy(parameters))
     weight = oracle.delight_weight(advantage, np.asarray(old), entropy)
     z = (action - mean) / np.exp(log_std)
