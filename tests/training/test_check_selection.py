@@ -12,7 +12,7 @@ import pytest
 import sauna
 from helpers import SMALL, configured, environment
 from sauna.algorithm.selection.registry import make_filter
-from sauna.config.presets import resolve
+from sauna.config.presets import ARMS, arm_settings, resolve
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
@@ -162,6 +162,9 @@ MISTAKEN = [
     ({"sampler_kwargs": "{}"}, "sampler_kwargs: not read"),
     ({"arm": "sauna", "filter_kwargs": "{}"}, "needs a filter of your own"),
     ({"arm": "random"}, "follows a rule; join it to one"),
+    ({"arm": "ppo,gigaflow"}, "gigaflow differs from the other arms in"),
+    ({"arm": "sauna,sauna+avec"}, "sauna+avec differs from the other arms in"),
+    ({"arm": "gigaflow+random+avec+spo+pods"}, "joins sampler gigaflow and sampler pods"),
     ({"arm": "gigaflow+pods"}, "joins sampler gigaflow and sampler pods"),
     ({"arm": "gigafow"}, "did you mean 'gigaflow'"),
     ({"sampler": "kondu"}, "did you mean 'kondo'"),
@@ -174,6 +177,17 @@ def test_rules_that_cannot_work_together_are_refused(settings: dict[str, Any], t
     with pytest.raises(BadInput) as found:
         resolve({"env": "worlds:Scripted", "arm": "ppo", **settings})
     assert text in str(found.value)
+
+
+def test_joined_rules_are_those_of_each_part() -> None:
+    """In any order, but a control follows what it is joined to; each part changes ppo."""
+    both = arm_settings("sauna+avec")
+    assert both == {**ARMS["sauna"], "critic": "avec", "clip_value": False}
+    turned = arm_settings("avec+sauna")
+    assert {name: turned[name] for name in both} == both
+    assert arm_settings("gigaflow+random") == {**ARMS["gigaflow"], "control": "random"}
+    resolved = resolve({"env": "worlds:Scripted", "arm": "gigaflow+stride"})
+    assert (resolved.sampler, resolved.control, resolved.filter) == ("gigaflow", "stride", "none")
 
 
 def test_an_own_filters_arguments_matter() -> None:

@@ -31,7 +31,9 @@ from sauna.algorithm.learner.update import (
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.distributions import gaussian
 from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.selection.control import controlled
 from sauna.algorithm.selection.delight import delight
+from sauna.algorithm.selection.gigaflow import gigaflow
 from sauna.algorithm.selection.gradient_norm import gradient_norm
 from sauna.algorithm.selection.registry import Rules
 from sauna.algorithm.types import (
@@ -262,6 +264,21 @@ def test_what_a_sampler_only_looks_at_is_counted(given: Given) -> None:
     assert counts(metrics) == [6, 2 * 48 + ROWS, 2 * 48] and bool(metrics.finite)
     assert 1 < metrics.work.effective_sample_size < SIZE
     assert not np.array_equal(state.params, given.state.params)
+
+
+def test_a_control_takes_as_many_steps_of_other_rows(given: Given) -> None:
+    """The rule keeps a part of the rows that fills no whole number of minibatches."""
+    rule = gigaflow(SETUP, threshold=0.3)
+    start = given.state._replace(sampler=rule.init())
+    data = (start, given.rollout, given.batch, given.hypers, given.order)
+    found = []
+    for sampler in (rule, controlled("random", rule)):
+        parts = given.parts._replace(rules=Rules(sampler=sampler))
+        found.append(jax.jit(partial(learn, parts=parts))(*data, no_key()))
+    (one, by_rule), (other, by_control) = found
+    assert by_rule.work == by_control.work and 0 < by_rule.work.sample_rate < 1
+    assert one.sampler == other.sampler
+    assert not np.allclose(one.params, other.params, rtol=1e-4, atol=2e-6)
 
 
 # ---------------------------------------------------------------------- advantages
