@@ -31,7 +31,7 @@ from sauna.experiments.report.page import rounded
 from sauna.experiments.study.report import UNFOLDED
 from sauna.experiments.study.results import gather
 from sauna.experiments.study.spec import load_spec
-from sauna.experiments.study.summary import FILTERING, summarize
+from sauna.experiments.study.summary import ABLATION, summarize
 from sauna.experiments.study.tables import PAPER, unversioned
 from sauna.experiments.study.units import units_of
 
@@ -115,9 +115,9 @@ def collect_measured(name: str) -> None:
         text = json.dumps(rounded(found), separators=(",", ":"))
         text = text.replace('{"task"', '\n{"task"') + "\n"
         (ROOT / "results" / f"{name}.json").write_text(text)
-    if (place / "figures" / "stills.png").exists():
+    if (place / "figures" / "frames.png").exists():
         STILLS.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(place / "figures" / "stills.png", STILLS)
+        shutil.copy(place / "figures" / "frames.png", STILLS)
 
 
 def load(name: str) -> dict[str, Any] | None:
@@ -211,7 +211,10 @@ def document() -> str:
         parts.append(shown_figures(name))
         parts.append(_verdicts(summary["verdicts"]))
         if summary["filtering"]:
-            parts += [f"Is it the filter? {FILTERING}", _verdicts(summary["filtering"])]
+            parts += [
+                f"Ablation of the selection rule. {ABLATION}",
+                _verdicts(summary["filtering"]),
+            ]
         parts.append(_same_runs(results))
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -332,10 +335,10 @@ def why() -> str:
         if measured is None or not measured["cells"]:
             parts.append(f"Not measured yet: `sauna study {name}`.")
             continue
-        extra = study.extra(measured)
+        extra = study.report(measured)
         drawn = draw_plots(extra.plots, extra.looks, ROOT / "docs" / "why")
         parts.append(f"`{measured['command']}`")
-        parts.append(_listed(study.verdicts(measured)))
+        parts.append(_listed(extra.answers))
         if study is posture_report and STILLS.exists() and posture_report.shown_pair(measured):
             parts.append(f"![Stills of one pair](why/figures/{STILLS.name})")
             parts.append(

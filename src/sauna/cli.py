@@ -295,7 +295,7 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
     if not any(row["seeds"] for row in summary["table"]):
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
     if number := summary.get("not_measured"):
-        log = Path(out) / spec.name / spec.measure / "stderr.txt"
+        log = spec.measurement.folder(Path(out) / spec.name) / "stderr.txt"
         raise SaunaError(
             f"{number} members are not measured; what is said above, and {log}, say why"
         )

@@ -169,7 +169,7 @@ def test_the_units_of_signs_are_signs(run, found) -> None:
         found.member.config, normalize_rewards=False, sign_rewards=True, dropped="mask"
     )
     changed = found._replace(member=found.member._replace(config=config))
-    told = meaning(changed)
+    told = "".join(meaning(changed))
     assert "in signs of rewards." in told and "raw units" not in told
     assert f"A rollout ends after {config.rollout_steps} env steps" in told
 
@@ -311,7 +311,7 @@ def test_what_cannot_be_drawn_is_said_in_one_line(run, monkeypatch, how) -> None
     path = sauna.inspect(run, member="sauna/0", say=said.append)
     assert len(said) == 1 and said[0].startswith("no pictures: ") and "\n" not in said[0]
     text = path.read_text()
-    assert "There are no pictures." in text and "<img" not in text
+    assert "There are no frames." in text and "<img" not in text
 
 
 def test_bad_input_creates_nothing(run, tmp_path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from sauna.experiments import curves
 from sauna.experiments import statistics as s
 
 # The example of scipy's `mannwhitneyu` documentation: age at diagnosis, U = 17, exact p = 0.1111.
@@ -238,7 +239,7 @@ def test_false_findings_in_simulation(scores, n: int) -> None:
     kinds = [against(scores(random, n), scores(random, n)).kind for _ in range(trials)]
     wrong = (kinds.count("better") + kinds.count("worse")) / trials
     assert wrong <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / trials)
-    assert (kinds.count("too few") == trials) == (n == 3)
+    assert (kinds.count("underpowered") == trials) == (n == 3)
 
 
 def test_false_findings_among_several_arms_and_without_holm() -> None:
@@ -274,10 +275,10 @@ def test_verdicts() -> None:
     assert against(low, high).kind == "worse"
     assert against(low + 0.1, low).kind == "no evidence"
     few = against(high[:3], low[:3])
-    assert (few.kind, few.least, few.needed) == ("too few", 4, 6)
-    assert against(high[:0], low) == ("too few", (None, None, None), 1.0, 4, None)
+    assert (few.kind, few.least, few.needed) == ("underpowered", 4, 6)
+    assert against(high[:0], low) == ("underpowered", (None, None, None), 1.0, 4, None)
     assert against(high[:1], low).needed is None
-    assert against(high[:2], np.arange(8.0)).kind == "too few"  # by the interval
+    assert against(high[:2], np.arange(8.0)).kind == "underpowered"  # by the interval
     assert s.compare({}) == {}
 
 
@@ -289,7 +290,7 @@ def test_holm_can_undo_a_verdict_and_raise_the_least_number_of_seeds() -> None:
     np.testing.assert_allclose(both["x"].p, 2 * s.exact_p(x, y))
     parted = np.arange(4.0) + 10
     assert against(parted, np.arange(4.0)).kind == "better"
-    assert s.compare({name: (parted, np.arange(4.0)) for name in "xz"})["x"].kind == "too few"
+    assert s.compare({name: (parted, np.arange(4.0)) for name in "xz"})["x"].kind == "underpowered"
 
 
 def test_over_tasks_by_hand_and_never_narrower_than_the_bootstrap() -> None:
@@ -312,35 +313,35 @@ def test_perfect_wins_on_all_tasks_are_not_certain() -> None:
 
 def test_area_by_hand() -> None:
     x = np.array([0.0, 10.0, 30.0])
-    assert s.area_under_curve(x, np.array([0.0, 2.0, 4.0])) == (10 + 60) / 30
-    assert s.area_under_curve(x * 7 + 5, np.full(3, 3.5)) == 3.5
+    assert curves.area_under_curve(x, np.array([0.0, 2.0, 4.0])) == (10 + 60) / 30
+    assert curves.area_under_curve(x * 7 + 5, np.full(3, 3.5)) == 3.5
 
 
 def test_area_begins_with_the_first_known_value_and_bridges_gaps() -> None:
     x = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
     y = np.array([np.nan, 1.0, np.nan, 4.0, np.nan])
-    assert s.area_under_curve(x, y) == 2.5
-    assert s.area_under_curve(x, np.full(5, np.nan)) is None
-    assert s.area_under_curve(x[:1], y[1:2]) is None
+    assert curves.area_under_curve(x, y) == 2.5
+    assert curves.area_under_curve(x, np.full(5, np.nan)) is None
+    assert curves.area_under_curve(x[:1], y[1:2]) is None
     with pytest.raises(ValueError, match="rise"):
-        s.area_under_curve(np.array([0.0, 0.0]), np.ones(2))
+        curves.area_under_curve(np.array([0.0, 0.0]), np.ones(2))
 
 
 def test_common_grid() -> None:
     same = np.array([1.0, 2.0, 5.0])
-    assert s.common_grid([same, same], 60) is same
-    grid = s.common_grid([np.arange(0.0, 100, 10), np.arange(25.0, 200, 10)], 60)
+    assert curves.common_grid([same, same], 60) is same
+    grid = curves.common_grid([np.arange(0.0, 100, 10), np.arange(25.0, 200, 10)], 60)
     assert grid[0] == 25 and grid[-1] == 90 and len(grid) <= 10 and (np.diff(grid) > 0).all()
-    assert len(s.common_grid([np.arange(500.0), np.arange(500.0)], 60)) == 60
-    assert len(s.common_grid([np.array([1.0, 2]), np.array([3.0, 4])], 60)) == 0
-    assert len(s.common_grid([same, np.zeros(0)], 60)) == len(s.common_grid([], 60)) == 0
+    assert len(curves.common_grid([np.arange(500.0), np.arange(500.0)], 60)) == 60
+    assert len(curves.common_grid([np.array([1.0, 2]), np.array([3.0, 4])], 60)) == 0
+    assert len(curves.common_grid([same, np.zeros(0)], 60)) == len(curves.common_grid([], 60)) == 0
 
 
 def test_interpolation_never_extrapolates() -> None:
     x, y = np.array([0.0, 1, 2, 3]), np.array([np.nan, 10, np.nan, 30])
-    got = s.on_grid(x, y, np.array([0, 0.9, 1, 1.5, 3, 3.1]))
+    got = curves.on_grid(x, y, np.array([0, 0.9, 1, 1.5, 3, 3.1]))
     np.testing.assert_array_equal(got, [np.nan, np.nan, 10, 15, 30, np.nan])
-    assert np.isnan(s.on_grid(x, np.full(4, np.nan), x)).all()
+    assert np.isnan(curves.on_grid(x, np.full(4, np.nan), x)).all()
 
 
 def test_mean_interval_by_hand_and_where_one_member_is_missing() -> None:

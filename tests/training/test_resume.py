@@ -12,7 +12,7 @@ import pytest
 import sauna
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna.config import presets
-from sauna.experiments.measure.streams import load_standing
+from sauna.experiments.measure.streams import load_snapshot
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
@@ -129,8 +129,8 @@ def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch, capsys
     assert {(m.config.learning_rate, m.config.gae_lambda) for m in held.members} == {(3e-4, 0.95)}
     told = capsys.readouterr().out
     assert "kept from the start: learning_rate 0.0003, gae_lambda 0.95" in told
-    standing = load_standing(run, held.members[0].name, 2)
-    assert float(standing.hypers.gae_lambda) == np.float32(0.95)
+    snapshot = load_snapshot(run, held.members[0].name, 2)
+    assert float(snapshot.hypers.gae_lambda) == np.float32(0.95)
     monkeypatch.undo()
     sauna.resume(run, quiet=True)
     assert (run / "metrics.jsonl").read_bytes() == expected

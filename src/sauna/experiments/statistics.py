@@ -46,9 +46,9 @@ class Estimate(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What the scores of an arm say against those of the baseline; see `compare`."""
+    """What the scores of an arm say beside those of the baseline; see `compare`."""
 
-    kind: str  # better, worse, no evidence, too few
+    kind: str  # better, worse, no evidence, underpowered
     improvement: Estimate  # P(arm > baseline)
     p: float  # of the exact test, after Holm's correction
     least: int  # seeds of each below which nothing can be found
@@ -257,8 +257,10 @@ def seeds_needed(chance: float, comparisons: int = 1, power: float = POWER) -> i
 
 
 def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Comparison]:
-    """Two arms' scores against each other, for each of a family of questions: other arms on one
-    task, or one arm on other tasks.
+    """Compares the scores of two arms, for each of a family of questions.
+
+    A family is other arms on one task, or one arm on other tasks. A score of -inf is the worst
+    outcome, as of a failed seed.
 
     `better` and `worse` need both: the exact test below `ALPHA` after Holm's correction over the
     family, and an interval that leaves 1/2 out. Where both have equal distributions, of whatever
@@ -266,8 +268,8 @@ def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Com
     wrong a little more often: in 6% to 8% of trials with 6 to 30 seeds of each and a spread five
     times the other, in 11% to 13% where the arm of lesser spread also has twice the seeds.
 
-    `too few` is where not even perfectly parted scores would pass. `needed` is None where a single
-    seed, or no difference, is all there is.
+    `underpowered`: not even perfectly parted scores would pass. `needed` is None if a single seed,
+    or no difference, is all there is.
 
     Args:
       pairs: name -> the scores of an arm `[n]` and of its baseline `[m]`, possibly empty.
@@ -283,11 +285,11 @@ def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Com
 def _comparison(x: np.ndarray, y: np.ndarray, p: float, lowest_p: float, family: int) -> Comparison:
     n, m = len(x), len(y)
     if min(n, m) == 0:
-        return Comparison("too few", Estimate(None, None, None), p, least_seeds(family), None)
+        return Comparison("underpowered", Estimate(None, None, None), p, least_seeds(family), None)
     estimate = improvement_estimate(x, y)
     needed = None if estimate.low is None else seeds_needed(improvement(x, y), family)
     reachable = lowest_p < ALPHA and _lower_end(1.0, n, m) > 0.5
-    kind = _kind(estimate, p) if reachable else "too few"
+    kind = _kind(estimate, p) if reachable else "underpowered"
     return Comparison(kind, estimate, p, least_seeds(family), needed)
 
 

@@ -1,14 +1,17 @@
-"""How every picture looks: the colour, line and marker of each label, and plain axes.
+"""How every figure looks: the colour, line and marker of each label, and plain axes.
 
 Matplotlib is imported where it is used: most commands draw nothing.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; an arm always has its colour.
 COLOURS = {
@@ -22,7 +25,7 @@ COLOURS = {
 _OTHER_ARMS = ("#56B4E9", "#882255", "#997700", "#4B5563")
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")  # matplotlib's names; one for each arm
 _DASHES: tuple[tuple[float, ...], ...] = ((), (6, 2.5), (1.5, 2), (8, 2.5, 1.5, 2.5))
-_SHADES = (0.0, 0.45, -0.45, 0.65)  # towards black on a light page, white where negative
+_SHADES = (0.0, 0.45, -0.45, 0.65)  # towards black, white if negative
 
 _RC: Any = {
     "axes.axisbelow": True,
@@ -42,7 +45,7 @@ _RC: Any = {
     "savefig.dpi": 130,
     "svg.fonttype": "none",  # text stays text: small, and it can be searched
     "svg.hashsalt": "sauna",  # ids of elements: the same in every run
-    "text.parse_math": False,  # a label is a name, also where it holds a dollar
+    "text.parse_math": False,  # a label is a name, even with a dollar in it
     "xtick.color": "#8A8D91",
     "xtick.labelcolor": "#3D4044",
     "xtick.labelsize": 8,
@@ -61,7 +64,6 @@ class Look(NamedTuple):
     """How one label is drawn: `dash` in points on and off, `marker` as matplotlib names it."""
 
     colour: str
-    colour_on_dark: str
     dash: tuple[float, ...]
     marker: str
 
@@ -84,7 +86,6 @@ def looks(arms: Mapping[str, str]) -> dict[str, Look]:
         shade = _SHADES[number % len(_SHADES)]
         found[label] = Look(
             colour=_mix(colour, shade),
-            colour_on_dark=_mix(colour, -shade),
             # Moves on when the shades start again, so that the pair is a new one.
             dash=_DASHES[(number + number // len(_SHADES)) % len(_DASHES)],
             marker=_MARKERS[(place + number) % len(_MARKERS)],
@@ -136,14 +137,41 @@ def draw_line(
     return line
 
 
+def draw_seed(axes: Any, look: Look, x: Any, y: Any) -> None:
+    """Draws a thin line for one seed."""
+    axes.plot(x, y, color=look.colour, alpha=0.45, linewidth=0.8)
+
+
 def count_steps(axes: Any) -> None:
     """The x axis counts env steps."""
     axes.set_xlabel("env steps")
     axes.xaxis.set_major_formatter(short)
 
 
+MIN_BAND = 3  # seeds: below, Student's t makes a band that hides the lines
+
+
+def fit_axes(axes: Any, lines: Any) -> None:
+    """Fits the y axis to `lines` (arrays); bands may add a third of their range on either side."""
+    known = [x[np.isfinite(x)] for x in (np.asarray(line, float) for line in lines)]
+    values = np.concatenate([*known, np.zeros(0)])
+    if not len(values):
+        return
+    low, high = values.min(), values.max()
+    room = (high - low) / 3 or abs(high) / 10 or 1.0
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(max(bottom, low - room), min(top, high + room))
+
+
 def save(figure: Any, path: Path) -> Path:
-    """Writes a picture whose bytes depend on what it shows alone."""
+    """Writes a figure to a file; its bytes depend on what it shows alone."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata=_METADATA[path.suffix])
     return path
+
+
+def as_svg(figure: Any) -> bytes:
+    """Draws a figure as SVG; its bytes depend on what it shows alone."""
+    file = io.BytesIO()
+    figure.savefig(file, format="svg", metadata=_METADATA[".svg"])
+    return file.getvalue()

@@ -118,7 +118,7 @@ def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
 def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
     """A member's last numbers and its thinned curve.
 
-    The area is that of the first `budget` env steps, also where kept steps are counted and a member
+    The AUC is that of the first `budget` env steps, also if kept steps are counted and a member
     takes more env steps.
     """
     last = rows[-1] if rows else {}
@@ -128,7 +128,7 @@ def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
     kept, tried = last.get("kept_steps"), last.get("env_steps")
     return {
         "final_return": last.get("return_mean"),
-        "area": area_under_curve(steps[within], returns[within]),
+        "auc": area_under_curve(steps[within], returns[within]),
         "env_steps": tried,
         "kept_steps": kept,
         "keep_rate": kept / tried if kept is not None and tried else None,
