@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | study | bench | list`.
+"""The command line: `sauna train | resume | eval | inspect | compare | plot | study | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -57,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--deterministic", action="store_true", help=text)
     evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
-    evaluate.add_argument("--video", action="store_true", help="film the first episode")
+    evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
@@ -74,7 +74,9 @@ def make_parser() -> argparse.ArgumentParser:
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, allow_abbrev=False)
-    compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
+    text = f"{FIELDS['env'].metadata['help']}; or runs that exist, as `plot` reads them"
+    compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
+    compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=text)
@@ -94,6 +96,13 @@ def make_parser() -> argparse.ArgumentParser:
         command.add_argument("--on", default="local", choices=("local", "ray"), help=text)
         text = "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)"
         command.add_argument("--address", default="", help=text)
+
+    text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
+    plot = commands.add_parser("plot", help=text, allow_abbrev=False)
+    plot.add_argument("runs", nargs="+", metavar="RUN")
+    text = "the figure, .png or .svg (default: learning_curves.png, of one run within it)"
+    plot.add_argument("--out", default="", metavar="FILE", help=text)
+    plot.add_argument("--tag", default="", help="of the returns in TensorBoard files")
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
@@ -268,14 +277,26 @@ def _whole(values: dict[str, Any], name: str, least: int) -> int:
 
 
 def _compare(values: dict[str, Any]) -> None:
+    from sauna.experiments.report.sources import is_source
     from sauna.experiments.study.command import compare_command, comparison
+    from sauna.experiments.study.existing import compare_existing
 
-    env, arms = values.pop("env"), tuple(values.pop("arms").split(","))
+    names, tag = values.pop("env"), values.pop("tag")
+    if len(names) > 1 or tag or any(is_source(Path(name)) for name in names):
+        print("\n".join(compare_existing([*map(Path, names)], tag, **values)))
+        return
+    env, arms = names[0] if names else "", tuple(values.pop("arms").split(","))
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
     spec = comparison(env, arms, parse_all(values))
     _run_study(spec, compare_command(env, arms, values, place["out"]), **place)
+
+
+def _plot(values: dict[str, Any]) -> None:
+    from sauna.experiments.report.curve import plot
+
+    print(f"figure: {plot([*map(Path, values['runs'])], values['out'], values['tag'])}")
 
 
 def _study(values: dict[str, Any]) -> None:
@@ -420,6 +441,7 @@ _COMMANDS = {
     "eval": _eval,
     "inspect": _inspect,
     "compare": _compare,
+    "plot": _plot,
     "study": _study,
     "bench": _bench,
     "list": _list,

@@ -83,13 +83,15 @@ class Section(NamedTuple):
 
 NOTHING = Section()
 
+TRAINING_RETURN = "Training return, mean of the last 100 episodes."
+
 # name of the file, key in the curves, title, caption, y axis, its limits
 _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] = (
     (
         "learning_curves",
         "return_mean",
         "Learning curves",
-        "Training return, mean of the last 100 episodes. Line: mean of the seeds; band: 95% "
+        TRAINING_RETURN + " Line: mean of the seeds; band: 95% "
         "interval, of fewer than three seeds each seed instead.",
         "return",
         None,
@@ -128,7 +130,7 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
         Plot(
             name,
             title,
-            caption,
+            caption.replace(TRAINING_RETURN, results.get("curve", TRAINING_RETURN)),
             "env steps",
             y_label,
             limits,
