@@ -155,7 +155,7 @@ def arms_table(name: str, results: dict[str, Any], summary: dict[str, Any]) -> s
     digits_of_task = digits_of_tasks(summary["table"])
     is_ppo = results["settings"].get("algorithm", "ppo") == "ppo"
     lines = [
-        "| task | arm | seeds | final return, IQM [95%] | mean +- std | keep rate | against | P(better) [95%] | paper |",  # noqa: E501
+        "| task | arm | seeds | final return, IQM [95%] | mean +- std | keep rate | against | P(improvement) [95%] | paper |",  # noqa: E501
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in summary["table"]:
@@ -279,7 +279,7 @@ def _revisions() -> str:
     equal = sum(len(run["equal"]) for run in runs)
     return (
         "The runs were trained by several revisions of the package, while it was made. Of every "
-        "study, arm and revision two runs (not of coins, which need whole runs of others) were "
+        "study, arm and revision two runs (not of random controls, which need whole runs) were "
         f"begun again by revision {stored['now']}: up to the second point of the curves, "
         f"{equal} of {sum(len(run['env_steps']) for run in runs)} came out with the same numbers "
         f"(`{stored['command']}`)."

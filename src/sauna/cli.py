@@ -69,8 +69,8 @@ def make_parser() -> argparse.ArgumentParser:
     inspect.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
-    text = "leave the pictures out: needs no renderer"
-    inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
+    text = "leave the frames out: needs no renderer"
+    inspect.add_argument("--no-frames", action="store_false", dest="frames", help=text)
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, allow_abbrev=False)

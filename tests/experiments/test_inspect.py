@@ -37,7 +37,7 @@ from sauna.experiments.inspect.inspection import (
     scaled,
 )
 from sauna.experiments.inspect.page import meaning
-from sauna.experiments.inspect.recording import MOST, SIDE, Pictures, Recorder, _played
+from sauna.experiments.inspect.recording import MAX_FRAMES, SIDE, Frames, Recorder, _played
 from sauna.system.errors import BadInput
 from worlds import Drawn, Lives, Scripted
 
@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def examined(run: Path, name: str = "sauna/0", **changes: Any) -> Inspection:
-    settings = {"episodes": 12, "deterministic": False, "seed": 3, "pictures": False, **changes}
+    settings = {"episodes": 12, "deterministic": False, "seed": 3, "frames": False, **changes}
     return examine(run, load_artifact(run), name, **settings, say=print)
 
 
@@ -272,26 +272,26 @@ def test_principal_components_of_many_pictures_are_those_of_some_pixels() -> Non
 def test_pictures_are_few_small_and_of_their_steps(run) -> None:
     from PIL import Image
 
-    drawn = examined(run, pictures=True).played.pictures
+    drawn = examined(run, frames=True).played.frames
     assert [row for row, _ in drawn] == [*range(len(drawn))]
-    pictures = [Image.open(io.BytesIO(data)) for _, data in drawn[:3]]
-    brightness = [np.asarray(picture.convert("L")).mean() for picture in pictures]
+    frames = [Image.open(io.BytesIO(data)) for _, data in drawn[:3]]
+    brightness = [np.asarray(picture.convert("L")).mean() for picture in frames]
     np.testing.assert_allclose(brightness, [0, 20, 40], atol=2)
 
     class Huge(Scripted):
         def render(self) -> np.ndarray:
             return np.zeros((400, 800, 3), np.uint8)
 
-    taken = Pictures(Huge(), print)
-    for row in range(3 * MOST):
+    taken = Frames(Huge(), print)
+    for row in range(3 * MAX_FRAMES):
         taken.take(row)
     rows = [row for row, _ in taken.taken]
-    assert MOST / 2 <= len(rows) <= MOST and np.unique(np.diff(rows)).tolist() == [4]
+    assert MAX_FRAMES / 2 <= len(rows) <= MAX_FRAMES and np.unique(np.diff(rows)).tolist() == [4]
     assert Image.open(io.BytesIO(taken.taken[0][1])).size == (SIDE, SIDE // 2)
     limited = Drawn("rgb_array")
     limited.reset(seed=0)
     limited.spec = SimpleNamespace(max_episode_steps=1000)  # type: ignore[assignment]
-    counted = Pictures(limited, print)
+    counted = Frames(limited, print)
     for row in range(1000):
         counted.take(row)
     assert [row for row, _ in counted.taken] == [*range(0, 1000, 4)]
@@ -309,7 +309,7 @@ def test_what_cannot_be_drawn_is_said_in_one_line(run, monkeypatch, how) -> None
     monkeypatch.setattr(Drawn, "__init__" if how == "cannot be made" else "render", broken)
     said: list[str] = []
     path = sauna.inspect(run, member="sauna/0", say=said.append)
-    assert len(said) == 1 and said[0].startswith("no pictures: ") and "\n" not in said[0]
+    assert len(said) == 1 and said[0].startswith("no frames: ") and "\n" not in said[0]
     text = path.read_text()
     assert "There are no frames." in text and "<img" not in text
 
@@ -403,7 +403,7 @@ def test_the_page_needs_nothing_else(page) -> None:
 
 
 def test_without_a_head_the_page_says_so(run, browser, tmp_path) -> None:
-    path = sauna.inspect(run, member="ppo/0", out=tmp_path / "ppo.html", pictures=False)
+    path = sauna.inspect(run, member="ppo/0", out=tmp_path / "ppo.html", frames=False)
     assert "There is no Vex prediction: ppo trains no Vex head" in path.read_text()
     assert "vex" not in data_of(path)["series"]
     browser.open(path, width=1280)
@@ -435,7 +435,7 @@ def test_picture_line_and_numbers_are_of_one_step(browser, page, found) -> None:
     browser.run(MOVE % dropped)
     now = shown(browser)
     assert now["decision"] == "dropped" and now["row"] == str(dropped)
-    assert now["picture"].endswith(data["pictures"]["images"][dropped])
+    assert now["picture"].endswith(data["frames"]["images"][dropped])
     for name, values in data["series"].items():
         assert float(now[name]) == values[dropped]
     browser.run(MOVE % 0)

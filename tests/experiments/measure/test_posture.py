@@ -169,10 +169,9 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
         measured([0.9, 0.1], [0.9, 0.1])
     )
     section = posture_report.report(found, tmp_path)
-    assert section.picture and section.picture.png
+    assert section.image and section.image.png
     assert (
-        "Chosen for the contrast" in section.picture.caption
-        and "Chosen" in section.plots[0].caption
+        "Chosen for the contrast" in section.image.caption and "Chosen" in section.plots[0].caption
     )
     picture = Image.open(tmp_path / "figures" / "frames.png")
     assert picture.width > picture.height
@@ -185,13 +184,11 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
         ("ppo", [None, 0.1 * 3]),
         ("sauna", [None, 0.1 * 3]),
     ]
-    assert (
-        "ppo seed 3, on its back (return 1,000), sauna seed 3, on its feet" in section.picture.alt
-    )
+    assert "ppo seed 3, on its back (return 1,000), sauna seed 3, on its feet" in section.image.alt
     for one in found["cells"]:
         for member in one["members"]:
             member["points"][0] |= {"frames": [], "not_drawn": "no <display>"}
-    assert posture_report.report(found, tmp_path).picture == (None, "", "No frames: no <display>.")
+    assert posture_report.report(found, tmp_path).image == (None, "", "No frames: no <display>.")
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def make_page(found: Inspection, run: Path) -> str:
         title=f"{config.env}, {found.member.name}",
         scope=scope(found),
         notes=notes(found),
-        frames=bool(found.played.pictures),
+        frames=bool(found.played.frames),
         states=states(found),
         scatter=found.points is not None,
         meaning=meaning(found),
@@ -58,7 +58,8 @@ def make_page(found: Inspection, run: Path) -> str:
 
 
 def compares(found: Inspection) -> bool:
-    """Whether the head's prediction is compared with an edge: a rule that can drop steps."""
+    """Returns whether the head's prediction is compared with an edge: a rule that can drop
+    steps."""
     return bool(found.hypers.threshold > 0) and bool(np.isfinite(found.decisions.edge).any())
 
 
@@ -67,7 +68,8 @@ def shows_vex(found: Inspection) -> bool:
 
 
 def page_data(found: Inspection) -> dict[str, Any]:
-    """What the script draws: a value per env step in every list of `series` and of the panels."""
+    """Returns what the script draws: a value per env step in every list of `series` and of the
+    panels."""
     played, decisions, config = found.played, found.decisions, found.member.config
     value, advantage = found.value.astype(float), found.advantage
     scaled = " (normalised)" if config.normalize_rewards else ""
@@ -104,15 +106,15 @@ def page_data(found: Inspection) -> dict[str, Any]:
         "series": {name: rounded(values.tolist()) for name, (_, values) in lines.items()},
         "panels": panels,
         "points": [] if found.points is None else rounded(found.points.T.tolist()),
-        "pictures": {
-            "rows": [row for row, _ in played.pictures],
-            "images": [base64.b64encode(data).decode() for _, data in played.pictures],
+        "frames": {
+            "rows": [row for row, _ in played.frames],
+            "images": [base64.b64encode(data).decode() for _, data in played.frames],
         },
     }
 
 
 def scope(found: Inspection) -> str:
-    """What was played, in one line."""
+    """Returns what was played, in one line."""
     played, episodes = found.played, len(found.played.returns)
     returns = ", ".join(f"{value:,.1f}" for value in played.returns[:5])
     more = ", ..." if episodes > 5 else ""
@@ -128,7 +130,7 @@ def scope(found: Inspection) -> str:
 
 
 def notes(found: Inspection) -> list[str]:
-    """What a reader must know before the page is looked at."""
+    """Returns what a reader must know before the page is looked at."""
     config, arm, kept = found.member.config, found.member.arm, float(found.decisions.keep.mean())
     said = []
     if not shows_vex(found):
@@ -159,13 +161,13 @@ def notes(found: Inspection) -> list[str]:
         said.append(
             f"Decisions look at {found.environments} environments together; environment 0 is shown."
         )
-    if not found.played.pictures:
+    if not found.played.frames:
         said.append("There are no frames.")
     return said
 
 
 def states(found: Inspection) -> str:
-    """What the scatter shows, in words."""
+    """Returns what the scatter shows, in words."""
     if found.points is None:
         return "Left out: the observations are too large for it."
     shares = " and ".join(f"{100 * share:.0f}%" for share in found.shares)
@@ -181,7 +183,7 @@ def _thinned(found: Inspection) -> str:
 
 
 def meaning(found: Inspection) -> list[Markup]:
-    """What the lines are, and their units; no value comes from a run but numbers."""
+    """Returns what the lines are, and their units; no value comes from a run but numbers."""
     config = found.member.config
     said = []
     if shows_vex(found):

@@ -47,7 +47,7 @@ def compute(snapshot: MemberSnapshot, scale: MemberSnapshot, file: Path) -> dict
 
 
 def particle_entropy(points: np.ndarray) -> float:
-    """Entropy in nats of the density that `points` `[N, D]` are drawn from."""
+    """Computes the entropy in nats of the density that `points` `[N, D]` are drawn from."""
     number, size = points.shape
     distance = scipy.spatial.cKDTree(points).query(points, NEIGHBOUR + 1)[0][:, -1]
     log_ball = 0.5 * size * math.log(math.pi) - scipy.special.gammaln(0.5 * size + 1)

@@ -120,7 +120,7 @@ def looks() -> dict[str, style.Look]:
 
 
 def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
-    """Every arm of a task whose threshold is known, in the order of the study.
+    """Returns every arm of a task whose threshold is known, in the order of the study.
 
     Of members that are measured: all of an arm's numbers are of the same ones.
     """
@@ -175,7 +175,7 @@ def tasks_of(measured: Mapping[str, Any]) -> list[str]:
 
 
 def over_members(mark: Mark, key: str) -> Estimate:
-    """Mean over members, and Student's t interval."""
+    """Computes the mean over members, and Student's t interval."""
     values = np.array([value for _, value in mark.members[key]])
     if len(values) < 2:
         return Estimate(float(values[0]) if len(values) else None, None, None)
@@ -183,7 +183,7 @@ def over_members(mark: Mark, key: str) -> Estimate:
 
 
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
-    """The head, and a row for each task and arm."""
+    """Returns the head, and a row for each task and arm."""
     names = [title for _, _, title, _ in QUANTITIES]
     rows = [["Task", "Arm", "Members", "Threshold", *names]]
     for task in tasks_of(measured):
@@ -195,7 +195,8 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
 
 
 def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | None:
-    """Rank correlation with a constant threshold, its p value, and the number of members.
+    """Computes the rank correlation with a constant threshold, its p value, and the number of
+    members.
 
     None where there are fewer than three thresholds. What is the same for all follows nothing.
     """
@@ -297,7 +298,7 @@ def _verdict(task: str, found: Sequence[Mark]) -> str:
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """Each quantity against the threshold, a panel for each task."""
+    """Returns each quantity against the threshold, a panel for each task."""
     found = {task: marks(measured, task) for task in tasks_of(measured)}
     drawn = []
     for key, name, title, caption in QUANTITIES:

@@ -70,7 +70,8 @@ class Measurement:
     curves: tuple[str, ...] = ()
 
     def folder(self, place: Path) -> Path:
-        """Where a study in `place` keeps this measurement's files; of 0.1.0 under the old name."""
+        """Returns where a study in `place` keeps this measurement's files; of 0.1.0 under the old
+        name."""
         for former, name in FORMER_NAMES.items():
             if name == self.name and (place / former).is_dir():
                 return place / former
@@ -78,7 +79,7 @@ class Measurement:
 
 
 def current_name(name: str) -> str:
-    """The name that a measurement has now."""
+    """Returns the name that a measurement has now."""
     return FORMER_NAMES.get(name, name)
 
 

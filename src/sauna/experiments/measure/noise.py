@@ -82,7 +82,8 @@ def _smallest(stream: Stream) -> int:
 
 
 def draw(stream: Stream, size: int, random: np.random.Generator) -> np.ndarray:
-    """Rows `[groups, MINIBATCHES, size]` of a stream, each minibatch without replacement."""
+    """Returns rows `[groups, MINIBATCHES, size]` of a stream, each minibatch without
+    replacement."""
     steps = len(stream.keep)
     control = random.permutation(steps)[: int(stream.keep.sum())]
     groups = (
@@ -103,7 +104,8 @@ def gradients_of(
     drawn: list[np.ndarray],
     standardized: bool,
 ) -> Gradients:
-    """The gradients of all reference streams, and of the minibatches `drawn` from the others."""
+    """Returns the gradients of all reference streams, and of the minibatches `drawn` from the
+    others."""
     gradient = partial(policy_gradient, policy=snapshot.program.policy)
     whole = jax.jit(partial(gradient, standardized=False))
     advantages = np.concatenate([stream.advantage for stream in reference])
@@ -141,7 +143,8 @@ def gradients_of(
 
 
 def padded(x: np.ndarray, length: int) -> np.ndarray:
-    """`x` `[n, ...]` with zeros behind, `[length, ...]` float32 (integers stay): one program."""
+    """Returns `x` `[n, ...]` with zeros behind, `[length, ...]` float32 (integers stay): one
+    program."""
     x = x.astype(np.float32) if x.dtype == np.float64 else x
     return np.concatenate([x, np.zeros((length - len(x), *x.shape[1:]), x.dtype)])
 

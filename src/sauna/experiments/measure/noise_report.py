@@ -121,7 +121,7 @@ def check(configs: Sequence[Config]) -> None:
 
 
 def drops_steps(config: Config) -> bool:
-    """Whether steps are dropped, and the advantages of dropped ones are known."""
+    """Returns whether steps are dropped, and the advantages of dropped ones are known."""
     return config.filter != "none" and config.gae_over != "kept"
 
 
@@ -139,13 +139,13 @@ def check_spaces(config: Config, spaces: Spaces) -> None:
 
 
 def looks() -> dict[str, style.Look]:
-    """A colour for each group of steps."""
+    """Returns a colour for each group of steps."""
     arms = {"kept": "sauna", "dropped": "vex-head", "control": "random-drop", "shifted": "ppo"}
     return dict(zip(arms, style.looks({arm: arm for arm in arms.values()}).values(), strict=True))
 
 
 def rule(point: Mapping[str, Any], raw: bool = False) -> Mapping[str, Any] | None:
-    """A checkpoint's estimates, advantages as in training or `raw`.
+    """Returns a checkpoint's estimates, advantages as in training or `raw`.
 
     None where too little was dropped.
     """
@@ -153,7 +153,8 @@ def rule(point: Mapping[str, Any], raw: bool = False) -> Mapping[str, Any] | Non
 
 
 def over_members(cell: Mapping[str, Any], *path: str, raw: bool = False) -> Estimate:
-    """Mean over members of their means over checkpoints, and its interval; geometric of ratios.
+    """Computes the mean over members of their means over checkpoints, and its interval; geometric
+    of ratios.
 
     Args:
       path: of the value in a checkpoint's estimates.
@@ -180,7 +181,7 @@ def _value(point: Mapping[str, Any], path: Sequence[str], raw: bool = False) -> 
 
 
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
-    """The head, and a row for each task and arm."""
+    """Returns the head, and a row for each task and arm."""
     rows = [list(HEAD)]
     for cell in measured["cells"]:
         rates = [point["keep_rate"] for point in _points(cell)]
@@ -227,13 +228,13 @@ def _alignment(cell: Mapping[str, Any]) -> str:
 
 
 def shown_ratio(estimate: Estimate) -> str:
-    """Three decimals where it is about 1, else as `shown`."""
+    """Returns three decimals where it is about 1, else as `shown`."""
     near = estimate.high is not None and 0.5 < estimate.high < 2
     return interval(estimate, 3) if near else shown(estimate)
 
 
 def shown(estimate: Estimate) -> str:
-    """Two significant digits of the value, and its interval to the same place."""
+    """Returns two significant digits of the value, and its interval to the same place."""
     value, low, high = estimate
     if value is None:
         return "-"
@@ -292,7 +293,7 @@ def _kind(estimate: Estimate, equal: float, noisier: int) -> str:
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """Each group along training, a panel for each task and arm."""
+    """Returns each group along training, a panel for each task and arm."""
     cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
     found = []
     for key, title, caption, label, limits in _PLOTS:

@@ -26,7 +26,8 @@ SIDE = 160  # pixels of a frame
 
 
 def pitch(env: Any) -> float:
-    """The torso's angle about its side axis in radians, -pi to pi; 0 is on its feet, level."""
+    """Returns the torso's angle about its side axis in radians, -pi to pi; 0 is on its feet,
+    level."""
     return math.remainder(float(env.unwrapped.data.joint("rooty").qpos[0]), math.tau)
 
 
@@ -67,7 +68,8 @@ def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]
 
 
 def clearest(upright: list[float], share: float) -> int:
-    """The episode that is the most on its feet where most states (`share`) are, or on its back."""
+    """Returns the episode that is the most on its feet where most states (`share`) are, or on its
+    back."""
     return int(np.argmax(upright) if share > 0.5 else np.argmin(upright))
 
 

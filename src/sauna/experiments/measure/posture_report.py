@@ -17,7 +17,7 @@ import scipy
 from sauna.config.settings import Config
 from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.report import style
-from sauna.experiments.report.figures import Line, Panel, Picture, Plot, Section
+from sauna.experiments.report.figures import Line, Panel, Plot, Section, SectionImage
 from sauna.experiments.statistics import ALPHA, Estimate
 from sauna.system.errors import BadInput
 
@@ -57,7 +57,7 @@ class Pair(NamedTuple):
 
 
 def postures(cell: Mapping[str, Any]) -> list[Posture]:
-    """The measured members of a cell."""
+    """Returns the measured members of a cell."""
     return [
         Posture(
             member["seed"],
@@ -73,7 +73,7 @@ def postures(cell: Mapping[str, Any]) -> list[Posture]:
 
 
 def share(found: list[Posture]) -> Estimate:
-    """Share of seeds on their feet, with Wilson's interval."""
+    """Computes the share of seeds on their feet, with Wilson's interval."""
     if not found:
         return Estimate(None, None, None)
     feet = sum(one.on_feet for one in found)
@@ -82,7 +82,7 @@ def share(found: list[Posture]) -> Estimate:
 
 
 def pairs(measured: Mapping[str, Any]) -> Iterator[Pair]:
-    """Every arm that has a baseline among the cells of its task.
+    """Returns every arm that has a baseline among the cells of its task.
 
     Of the seeds whose posture differs between the arms, McNemar's test asks whether as many differ
     one way as the other: a binomial test with a chance of one half.
@@ -116,7 +116,7 @@ def verdicts(measured: Mapping[str, Any]) -> list[str]:
 
 
 def shown(estimate: Estimate) -> str:
-    """`25% [11%, 47%]`; `-` where there is none."""
+    """Returns `25% [11%, 47%]`; `-` where there is none."""
     value, low, high = estimate
     return "-" if value is None else f"{value:.0%} [{low:.0%}, {high:.0%}]"
 
@@ -163,7 +163,7 @@ def check(configs: Sequence[Config]) -> None:
 
 
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
-    """The head, and a row for each arm."""
+    """Returns the head, and a row for each arm."""
     rows = [["Arm", "Seeds", "On its feet", "Between", "Return on its feet", "Return on its back"]]
     for cell in measured["cells"]:
         found = postures(cell)
@@ -175,7 +175,7 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
 
 
 def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
-    """The two members whose frames are shown, the baseline's first.
+    """Returns the two members whose frames are shown, the baseline's first.
 
     The first seed on its feet in the arm and on its back in the baseline; failing that, the first
     that is measured in both.
@@ -193,7 +193,7 @@ def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
 
 
 def chosen(measured: Mapping[str, Any]) -> str:
-    """How the pair that is shown was chosen, and how usual it is."""
+    """Returns how the pair that is shown was chosen, and how usual it is."""
     pair = next(pair for pair in pairs(measured) if pair.seeds)
     return (
         f"Chosen for the contrast: the first seed of which only {pair.label} is on its feet "
@@ -202,7 +202,7 @@ def chosen(measured: Mapping[str, Any]) -> str:
     )
 
 
-def _frames(measured: Mapping[str, Any], folder: Path) -> Picture | None:
+def _frames(measured: Mapping[str, Any], folder: Path) -> SectionImage | None:
     """The frames of a pair in one picture, or why there are none."""
     pair = shown_pair(measured)
     if not pair or not all(one.frames for _, one in pair):
@@ -213,9 +213,9 @@ def _frames(measured: Mapping[str, Any], folder: Path) -> Picture | None:
             for point in member["points"]
             if "not_drawn" in point
         ]
-        return Picture(None, "", f"No frames: {reasons[0]}.") if reasons else None
+        return SectionImage(None, "", f"No frames: {reasons[0]}.") if reasons else None
     text = ", ".join(f"{label} seed {one.seed}, {_posture(one)}" for label, one in pair)
-    return Picture(
+    return SectionImage(
         draw_frames(pair, folder).read_bytes(),
         f"Frames of {text}",
         f"One pair at equal times, in env steps: {text}. {chosen(measured)} Of each its clearest "
@@ -224,7 +224,7 @@ def _frames(measured: Mapping[str, Any], folder: Path) -> Picture | None:
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """The explained variance of both members of the pair over training."""
+    """Returns the explained variance of both members of the pair over training."""
     pair = shown_pair(measured)
     if not pair:
         return []

@@ -69,7 +69,7 @@ class Fresh(NamedTuple):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Every env step that was taken."""
+        """Returns every env step that was taken."""
         used = sum(len(stream.keep) for stream in self.streams)
         return {"env_steps_used": used, "env_steps_thrown_away": self.thrown_away}
 
@@ -111,7 +111,8 @@ def load_snapshot(run: Path, name: str, iteration: int) -> MemberSnapshot:
 def fresh_streams(
     snapshot: MemberSnapshot, number: int, rollouts: int, limit: int | None = None
 ) -> Fresh:
-    """`number` independent streams of `rollouts` rollouts; the same for the same checkpoint.
+    """Returns `number` independent streams of `rollouts` rollouts; the same for the same
+    checkpoint.
 
     Args:
       limit: env steps that each env tries in a rollout at most; by default as in training.
@@ -184,7 +185,8 @@ def _put_moments(collector: HostCollector, snapshot: MemberSnapshot) -> None:
 
 
 def moved_in_time(decisions: list[list[np.ndarray]], random: np.random.Generator) -> np.ndarray:
-    """A stream's decisions, each env's moved round its whole time line by one random offset.
+    """Returns a stream's decisions, each env's moved round its whole time line by one random
+    offset.
 
     Moved within a rollout, those of A2C's short ones would hardly move.
 
@@ -231,7 +233,7 @@ class _Recorded:
         self._shown = [observation.copy()]
 
     def seen(self) -> np.ndarray:
-        """`[S, P, N, *obs]`: the observation at each env step since `begin`."""
+        """Returns `[S, P, N, *obs]`: the observation at each env step since `begin`."""
         return np.stack(self._shown[:-1])
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Any:

@@ -20,7 +20,7 @@ GRID = 100  # points at which members' curves are compared
 def member_curves(
     rows: list[dict[str, Any]],
 ) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """`arm -> member -> (env steps, mean return of the last 100 episodes)`."""
+    """Returns `arm -> member -> (env steps, mean return of the last 100 episodes)`."""
     points: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for row in rows:
         if "return_mean" in row:
@@ -36,7 +36,7 @@ def member_curves(
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """95% interval of the mean over members `[P, X]` (Student's t)."""
+    """Computes the 95% interval of the mean over members `[P, X]` (Student's t)."""
     from scipy import stats
 
     number = values.shape[0]

@@ -50,7 +50,7 @@ class Plot:
     panels: list[Panel]
 
 
-class Picture(NamedTuple):
+class SectionImage(NamedTuple):
     """An image of a section; without `png` its caption says why there is none."""
 
     png: bytes | None
@@ -68,7 +68,7 @@ class Section(NamedTuple):
       table: the head and the rows; the first column names a row.
       table_name: for readers who hear the page.
       plots, looks: figures, and how their lines look.
-      picture: an image.
+      image: a picture.
     """
 
     title: str = ""
@@ -78,7 +78,7 @@ class Section(NamedTuple):
     table_name: str = ""
     plots: Sequence[Plot] = ()
     looks: Mapping[str, style.Look] = MappingProxyType({})
-    picture: Picture | None = None
+    image: SectionImage | None = None
 
 
 NOTHING = Section()
@@ -125,7 +125,7 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
 
 
 def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plot]:
-    """Every figure that has something to show."""
+    """Returns every figure that has something to show."""
     plots = [
         Plot(
             name,
@@ -157,7 +157,7 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
 
 
 def looks_of(results: Mapping[str, Any]) -> dict[str, style.Look]:
-    """The look of each label of a study, in the order of its cells."""
+    """Returns the look of each label of a study, in the order of its cells."""
     return style.looks({cell["label"]: cell["arm"] for cell in results["cells"]})
 
 
@@ -242,7 +242,7 @@ def draw_plots(
     return written
 
 
-def panel_picture(plot: Plot, panel: Panel, looks: Mapping[str, style.Look]) -> bytes:
+def panel_svg(plot: Plot, panel: Panel, looks: Mapping[str, style.Look]) -> bytes:
     """Draws one panel without a legend, as SVG."""
     from matplotlib.figure import Figure
 

@@ -85,7 +85,8 @@ def read_sources(paths: Sequence[Path], tag: str = "") -> list[Source]:
 
 
 def is_source(path: Path) -> bool:
-    """Whether a path looks like a run, a CSV file or TensorBoard files rather than a name."""
+    """Returns whether a path looks like a run, a CSV file or TensorBoard files rather than a
+    name."""
     return (
         path.suffix == ".csv"
         or (path / "config.json").is_file()

@@ -69,7 +69,7 @@ class Look(NamedTuple):
 
 
 def looks(arms: Mapping[str, str]) -> dict[str, Look]:
-    """`label -> Look`, no two alike, from `label -> arm` in the order of the study.
+    """Returns `label -> Look`, no two alike, from `label -> arm` in the order of the study.
 
     An arm's first label has the arm's own colour and a solid line; its further labels (say
     `sauna 0.8`) have shades of it and other dashes and markers.
@@ -101,7 +101,7 @@ def _mix(colour: str, share: float) -> str:
 
 
 def short(value: float, position: object = None) -> str:
-    """`200000 -> 200k`, `1000000 -> 1M`: ticks of env steps."""
+    """Returns `200000 -> 200k`, `1000000 -> 1M`: ticks of env steps."""
     for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{suffix}"
@@ -109,7 +109,7 @@ def short(value: float, position: object = None) -> str:
 
 
 def applied() -> AbstractContextManager[None]:
-    """Within it, matplotlib draws in this style."""
+    """Applies this style to what matplotlib draws within it."""
     import matplotlib
 
     return matplotlib.rc_context(_RC)
@@ -118,7 +118,7 @@ def applied() -> AbstractContextManager[None]:
 def draw_line(
     axes: Any, look: Look, x: Any, y: Any, low: Any, high: Any, *, label: str = ""
 ) -> Any:
-    """A line with about eight markers and, where `low` and `high` are not NaN, its band."""
+    """Draws a line with about eight markers and, where `low` and `high` are not NaN, its band."""
     every = max(1, len(x) // 8)
     first = 2 * len(axes.get_lines()) % every  # lines that lie on each other show both markers
     axes.fill_between(x, low, high, color=look.colour, alpha=0.16, linewidth=0)
@@ -143,7 +143,7 @@ def draw_seed(axes: Any, look: Look, x: Any, y: Any) -> None:
 
 
 def count_steps(axes: Any) -> None:
-    """The x axis counts env steps."""
+    """Makes the x axis count env steps."""
     axes.set_xlabel("env steps")
     axes.xaxis.set_major_formatter(short)
 

@@ -26,17 +26,18 @@ class Cell(NamedTuple):
     config: Mapping[str, Any] = MappingProxyType({})  # empty where only numbers were stored
 
     def values(self, name: str) -> np.ndarray:
-        """The finite values of a member's entry `name`, over complete members."""
+        """Returns the finite values of a member's entry `name`, over complete members."""
         found = np.array([member.get(name) for member in self.complete], float)
         return found[np.isfinite(found)]
 
     def scores(self) -> np.ndarray:
-        """Final returns as the tests take them: a failed member has the worst outcome, -inf."""
+        """Returns final returns as the tests take them: a failed member has the worst outcome,
+        -inf."""
         return np.concatenate([self.values("final_return"), np.full(self.failed, -np.inf)])
 
     @property
     def too_many_failed(self) -> bool:
-        """Whether more than `MAX_FAILED` of the members that ended have failed."""
+        """Returns whether more than `MAX_FAILED` of the members that ended have failed."""
         return self.failed > MAX_FAILED * (self.failed + len(self.complete))
 
     def mean(self, name: str) -> float | None:

@@ -39,7 +39,7 @@ SEEDS = 6  # of a comparison, where none are given
 
 
 def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
-    """The study that `sauna compare ENV` runs: its folder is named after its settings.
+    """Returns the study that `sauna compare ENV` runs: its folder is named after its settings.
 
     Raises:
       BadInput: unknown arms or settings that cannot be used.
@@ -60,13 +60,13 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
 def compare_command(
     env: str, arms: tuple[str, ...], settings: Mapping[str, Any], out: str | Path
 ) -> str:
-    """What a user types to make the same comparison again."""
+    """Returns what a user types to make the same comparison again."""
     flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
     return f"sauna compare {shlex.quote(env)} --arms {','.join(arms)}{flags}{_typed_out(out)}"
 
 
 def study_command(name: str, out: str | Path) -> str:
-    """What a user types to run the study again."""
+    """Returns what a user types to run the study again."""
     return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
 
 
@@ -273,7 +273,7 @@ def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
-    """The table and the verdicts, as text."""
+    """Returns the table and the verdicts, as text."""
     head = [
         "task",
         "arm",

@@ -65,14 +65,14 @@ def compare_existing(
 
 
 def ends_of(sources: Sequence[Source]) -> str:
-    """Where each arm ends, in a sentence: what lies behind the first end is not compared."""
+    """Writes where each arm ends: what lies behind the first end is not compared."""
     ends = {s.label: min(curve.x[-1] for curve in s.seeds.values()) for s in sources}
     listed = ", ".join(f"{label} at {short(end)}" for label, end in ends.items())
     return f"compared up to {short(min(ends.values()))} env steps; the arms end: {listed}"
 
 
 def results_of(sources: Sequence[Source], command: str) -> dict[str, Any]:
-    """The curves as `results.json` has them, cut where the first of them ends.
+    """Returns the curves as `results.json` has them, cut where the first of them ends.
 
     Raises:
       BadInput: there is no env step that all curves have.

@@ -45,7 +45,7 @@ class Item(NamedTuple):
 
 
 def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> list[Item]:
-    """Every complete member that can be measured.
+    """Returns every complete member that can be measured.
 
     What is measured in a scale belongs to the scale's checkpoint as well.
     """
@@ -102,7 +102,8 @@ def _mark(run: Path, iteration: int) -> str:
 
 
 def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) -> dict[float, int]:
-    """`{point: iteration}`: the checkpoint of a seed nearest to each point, none of them twice."""
+    """Returns `{point: iteration}`: the checkpoint of a seed nearest to each point, none of them
+    twice."""
     rows = [row for row in run_directory.rows(run) if row["seed"] == seed]
     reached = {
         int(path.name): max(
@@ -119,7 +120,8 @@ def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) 
 
 
 def scale_of(spec: Spec, items: list[Item], task: str) -> dict[str, Any] | None:
-    """Whose normaliser scales the observations of all arms: the baseline's first seed at its end.
+    """Returns whose normaliser scales the observations of all arms: the baseline's first seed at
+    its end.
 
     None while that is not trained. It is never another seed, so that all measurements, early and
     late ones, have one scale.
@@ -220,7 +222,8 @@ def _start(
 def gather_measured(
     spec: Spec, units: list[Unit], folder: Path, place: Path, results: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What has been measured so far, beside the numbers of `results` that it is compared with.
+    """Returns what has been measured so far, beside the numbers of `results` that it is compared
+    with.
 
     Every cell of `results` that can be measured is there, and of each complete member its
     `points`: none of a member whose later checkpoints are still to be measured, since early ones
@@ -285,12 +288,13 @@ def _curves(curve: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def mean_over_training(curve: Mapping[str, Any], name: str) -> float | None:
-    """A curve's mean over env steps; None where it has no values."""
+    """Returns a curve's mean over env steps; None where it has no values."""
     return area_under_curve(np.array(curve["env_steps"], float), _values(curve, name))
 
 
 def usual(curve: Mapping[str, Any], name: str) -> float | None:
-    """A curve's median: a threshold that keeps a target rate is far off if the median is near 0."""
+    """Returns a curve's median: a threshold that keeps a target rate is far off if the median is
+    near 0."""
     values = _values(curve, name)
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None

@@ -13,7 +13,7 @@ from sauna.experiments.report.figures import (
     Plot,
     Section,
     looks_of,
-    panel_picture,
+    panel_svg,
     plots_of,
     write_figures,
 )
@@ -90,7 +90,8 @@ def make_page(
 
 
 def question(results: Mapping[str, Any], section: Section = NOTHING) -> str:
-    """The page's title: the study's own question, its measurement's, or what it compares."""
+    """Returns the page's title: the study's own question, its measurement's, or what it
+    compares."""
     if own := results["settings"].get("question"):
         return str(own)
     if section.title:
@@ -109,7 +110,7 @@ def question(results: Mapping[str, Any], section: Section = NOTHING) -> str:
 
 
 def answer(summary: Mapping[str, Any], section: Section = NOTHING) -> str:
-    """The page's first sentence: what the verdicts come to."""
+    """Returns the page's first sentence: what the verdicts come to."""
     if section.title and section.answers:
         return section.answers[0]
     found = summary["verdicts"]
@@ -145,7 +146,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def scope(results: Mapping[str, Any]) -> list[str]:
-    """How much was trained."""
+    """Returns how much was trained."""
     cells = results["cells"]
     return [
         _plural(len({cell["task"] for cell in cells}), "task"),
@@ -163,13 +164,13 @@ def _plural(count: int, noun: str) -> str:
 
 
 def totals(found: Sequence[Mapping[str, Any]]) -> str:
-    """`2 better, 3 no evidence`."""
+    """Returns `2 better, 3 no evidence`."""
     counts = Counter(verdict["kind"] for verdict in found)
     return ", ".join(f"{count} {kind}" for kind, count in counts.items())
 
 
 def pairs(found: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, dict[str, Any]]]:
-    """Each pair of arms that is compared, and its verdicts by task."""
+    """Returns each pair of arms that is compared, and its verdicts by task."""
     return [
         (
             label,
@@ -184,14 +185,15 @@ def _panel(plot: Plot, panel: Panel, looks: Mapping[str, Look]) -> dict[str, Any
     """What the page shows of one panel."""
     return {
         "task": panel.task,
-        "svg": panel_picture(plot, panel, looks) if panel.lines else None,
+        "svg": panel_svg(plot, panel, looks) if panel.lines else None,
         "text": panel_text(plot, panel),
         "readout": read_out(plot, panel),
     }
 
 
 def panel_text(plot: Plot, panel: Panel) -> str:
-    """What a panel shows, in words: the last value of each line (the middle one of a profile)."""
+    """Returns what a panel shows, in words: the last value of each line (the middle one of a
+    profile)."""
     values = []
     for line in panel.lines:
         points = [(x, y) for x, y in zip(line.x, line.y, strict=True) if None not in (x, y)]

@@ -31,7 +31,7 @@ DIGITS = 6  # significant digits of a curve's points
 
 
 def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[str, Any]:
-    """Everything that is known, one entry per trained member; see `docs/studies.md`."""
+    """Gathers everything that is known, one entry per trained member."""
     cells = [
         _cell(arm, task, [u for u in units if (u.label, u.task) == (arm.label, task)], folder)
         for task in spec.tasks
@@ -87,7 +87,8 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
 
 
 def typed(name: str, value: Any) -> str:
-    """A setting as it is typed; one seed ends in a comma, without which it would be a count."""
+    """Returns a setting as it is typed; one seed ends in a comma, without which it would be a
+    count."""
     if isinstance(value, bool):
         return flag(name) if value else flag("no_" + name)
     if isinstance(value, list | tuple):

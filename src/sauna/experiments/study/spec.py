@@ -61,7 +61,7 @@ class Arm(NamedTuple):
     rates_of: str | None  # the label whose drop rates it repeats
 
     def given(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
-        """The settings of a run of some seeds on one task."""
+        """Returns the settings of a run of some seeds on one task."""
         return {**self.settings, "env": task, "arm": self.arm, "seeds": list(seeds)}
 
 
@@ -84,7 +84,7 @@ class Spec(NamedTuple):
 
 
 def read_spec(values: Mapping[str, Any]) -> Spec:
-    """The study that `values` describe.
+    """Reads the study that `values` describe.
 
     Raises:
       BadInput: an unknown key, a label twice or unknown, or settings that cannot be used.
@@ -167,7 +167,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
 
 
 def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
-    """Whether a run of `arm` with these settings takes the setting `key` at all."""
+    """Returns whether a run of `arm` with these settings takes the setting `key` at all."""
     config = dataclasses.replace(arm_config(arm, parse_all(settings)), arm=(arm,))
     try:
         check_read([config], {key: None})
@@ -234,7 +234,7 @@ def _rules_of(source: Arm, control: Arm) -> dict[str, Any]:
 
 
 def check(arm: Arm, task: str) -> Config:
-    """The config of a run of `arm`; a random-drop arm's source is settled later.
+    """Resolves the config of a run of `arm`; a random-drop arm's source is settled later.
 
     Raises:
       BadInput: the settings cannot be used; the label is named.
@@ -256,7 +256,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load_spec(name: str) -> Spec:
-    """A study of this package by name, or one in a TOML file.
+    """Loads a study of this package by name, or one in a TOML file.
 
     Raises:
       BadInput: there is no such study or file, or it cannot be read.
@@ -277,7 +277,7 @@ def load_spec(name: str) -> Spec:
 
 
 def built_in() -> dict[str, str]:
-    """The studies of this package: `{name: text}`."""
+    """Returns the studies of this package: `{name: text}`."""
     folder = resources.files("sauna.experiments.study") / "studies"
     return {
         entry.name.removesuffix(".toml"): entry.read_text()

@@ -47,7 +47,7 @@ QUANTITIES = {
 
 
 def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
-    """What `results` (format 1) support: verdicts, table, profiles and curves, ready for JSON.
+    """Summarizes `results` (format 1): verdicts, table, profiles and curves, ready for JSON.
 
     Values that cannot be computed are None.
 

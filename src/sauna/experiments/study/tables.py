@@ -45,7 +45,7 @@ def main_columns(baseline: str) -> tuple[str, ...]:
 
 
 def main_groups(summary: Mapping[str, Any], looks: Mapping[str, Look]) -> list[dict[str, Any]]:
-    """The rows of the main table, task by task, each with its look and its whisker."""
+    """Returns the rows of the main table, task by task, each with its look and its whisker."""
     groups = []
     for task, digits in digits_of_tasks(summary["table"]).items():
         own = [row for row in summary["table"] if row["task"] == task]
@@ -64,7 +64,8 @@ def _whisker(row: Mapping[str, Any], of_task: Sequence[Mapping[str, Any]]) -> li
 
 
 def paper(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The paper's numbers beside those of our PPO, for the tasks that it has; None for others."""
+    """Returns the paper's numbers beside those of our PPO, for the tasks that it has; None for
+    others."""
     is_ppo = {
         (cell["task"], cell["label"]): cell["config"].get("algorithm", "ppo") == "ppo"
         for cell in results["cells"]
@@ -93,12 +94,12 @@ def _printed(mean: float, std: float) -> str:
 
 
 def unversioned(task: str) -> str:
-    """The task's name without its version."""
+    """Returns the task's name without its version."""
     return re.sub(r"-v\d+$", "", task)
 
 
 def failures(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Every failed seed with all of its error's text."""
+    """Returns every failed seed with all of its error's text."""
     return [
         {"task": cell["task"], "label": cell["label"], **member}
         for cell in cells
@@ -108,7 +109,7 @@ def failures(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def settings(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Every setting: of each cell, and of what the study itself ran on."""
+    """Returns every setting: of each cell, and of what the study itself ran on."""
     base = {c["task"]: c for c in results["cells"] if c["label"] == results["baseline"]}
     groups = [
         (name, values)

@@ -91,7 +91,8 @@ def embedded(value: Any) -> str:
 
 
 def rounded(value: Any) -> Any:
-    """A JSON value with its numbers to five digits, and null for those that are not finite."""
+    """Returns a JSON value with its numbers to five digits, and null for those that are not
+    finite."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
