@@ -26,13 +26,15 @@ from sauna.algorithm.selection.vex_filter import (
     sauna_per_env,
     threshold_held,
 )
-from sauna.algorithm.types import Filter
+from sauna.algorithm.types import StepFilter
 from sauna.system.errors import BadInput
 from sauna.training.loop.budget import hypers_now, scheduled
 from sauna.training.loop.member_state import Counters
 
 
-def run(filter: Filter, vex: np.ndarray, threshold: float = 0.3, rate: float = 0.0) -> np.ndarray:
+def run(
+    filter: StepFilter, vex: np.ndarray, threshold: float = 0.3, rate: float = 0.0
+) -> np.ndarray:
     """The filter's mask `[S, N]`, decided step by step."""
     state = filter.init(vex.shape[1], len(vex))
     h = jax.tree.map(np.float32, hypers(threshold=threshold, drop_rate=rate))
@@ -199,7 +201,7 @@ def test_a_keep_rate_is_held_whatever_the_predictions(kind: str, rate: float) ->
         assert run_quickly(sauna_per_env("all", steps), vex, 0.8).all()
 
 
-def run_quickly(filter: Filter, vex: np.ndarray, threshold: float = 0.3) -> np.ndarray:
+def run_quickly(filter: StepFilter, vex: np.ndarray, threshold: float = 0.3) -> np.ndarray:
     h = jax.tree.map(np.float32, hypers(threshold=threshold))
     state = filter.init(vex.shape[1], len(vex))
     none = jnp.zeros((len(vex), vex.shape[1], 1))

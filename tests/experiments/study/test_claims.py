@@ -106,7 +106,8 @@ def test_failed_seeds_count_as_the_worst_outcome() -> None:
     results = study((HIGH, HIGH, HIGH))
     results["cells"][-1]["members"][0] |= {"status": "failed", "final_return": None}
     assert said(results)["so"] == (
-        "better on A, B, C; better over the tasks by the interval; 1 failed seeds count as the worst outcome"
+        "better on A, B, not decided on the other 1; better over the tasks by the interval; "
+        "1 failed seeds count as the worst outcome"
     )
 
 

@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sauna.config.presets import ARMS
+from sauna.config.presets import arm_settings
 from sauna.config.settings import Config
 from sauna.experiments.statistics import ALPHA, POWER, Comparison, compare
 from sauna.experiments.study.cells import MAX_FAILED, Cell
+from sauna.system.errors import BadInput
 
 # Settings that two arms may differ in and yet differ in the choice of steps alone.
 FILTERS_OWN = (
@@ -69,7 +70,7 @@ def ablations_of(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
         f"{cell.label} - {other.label}": (cell, other)
         for cell in cells
         for other in cells
-        if ARMS.get(cell.arm, {}).get("filter") == "sauna" and _is_control(other, cell)
+        if _settings(cell.arm).get("filter") == "sauna" and _is_control(other, cell)
     }
     found = compare(
         {name: (cell.scores(), other.scores()) for name, (cell, other) in pairs.items()}
@@ -92,7 +93,7 @@ def _is_control(other: Cell, cell: Cell) -> bool:
         return all(cell.config.get(name) == other.config.get(name) for name in names)
     return all(
         getattr(Config(), name) == value
-        for name, value in ARMS[cell.arm].items()
+        for name, value in _settings(cell.arm).items()
         if name not in FILTERS_OWN
     )
 
@@ -220,7 +221,15 @@ def _missing(cell: Cell) -> dict[str, int]:
 
 
 def _filters(cell: Cell) -> bool:
-    return ARMS.get(cell.arm, {}).get("filter") != "none"
+    return _settings(cell.arm).get("filter") != "none"
+
+
+def _settings(arm: str) -> dict[str, Any]:
+    """The settings of an arm; none if this version does not know it."""
+    try:
+        return arm_settings(arm)
+    except BadInput:
+        return {}
 
 
 def _filtering(cell: Cell, name: str) -> str:
