@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from arrays import hypers
+from arrays import hypers, unscored
 from helpers import configured, equal, make_job, own, resumed, train_here
 from sauna.algorithm.rollout.program import decide
 from sauna.algorithm.selection import vex_filter
@@ -41,7 +41,7 @@ def run(
     masks, keep = [], jax.jit(filter.keep)
     for t, x in enumerate(vex):
         key = jax.random.fold_in(jax.random.key(5), t)
-        state, mask = keep(state, jnp.zeros((vex.shape[1], 2)), jnp.asarray(x), key, h)
+        state, mask = keep(state, unscored(jnp.zeros((vex.shape[1], 2)), jnp.asarray(x)), key, h)
         masks.append(np.asarray(mask))
     return np.stack(masks)
 
@@ -140,8 +140,7 @@ def test_deciding_in_stretches_is_deciding_step_by_step(name: str) -> None:
         state, mask = decide(
             filter,
             state,
-            jnp.zeros((30, 2, 4)),
-            jnp.asarray(padded),
+            unscored(jnp.zeros((30, 2, 4)), jnp.asarray(padded)),
             t,
             length,
             jax.random.key(5),
@@ -206,7 +205,7 @@ def run_quickly(filter: StepFilter, vex: np.ndarray, threshold: float = 0.3) -> 
     state = filter.init(vex.shape[1], len(vex))
     none = jnp.zeros((len(vex), vex.shape[1], 1))
     call = jax.jit(lambda *a: decide(filter, *a, h))
-    mask = call(state, none, jnp.asarray(vex), 0, len(vex), jax.random.key(0))[1]
+    mask = call(state, unscored(none, jnp.asarray(vex)), 0, len(vex), jax.random.key(0))[1]
     return np.asarray(mask)
 
 
