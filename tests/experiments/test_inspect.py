@@ -21,9 +21,9 @@ from helpers import SMALL, configured, own
 from sauna.algorithm.learner.samples import make_batch
 from sauna.algorithm.learner.vex_targets import make_target
 from sauna.algorithm.rollout.collected import capacity
-from sauna.algorithm.rollout.program import decide as decide_stretch
+from sauna.algorithm.rollout.program import decide as decide_segment
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.types import Hypers, Rollout
+from sauna.algorithm.types import Hypers, Rollout, ScoredStep
 from sauna.config.settings import Config
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -103,8 +103,7 @@ def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) ->
         dropped=dropped,
     )
     vex = np.random.default_rng(0).normal(size=(70, envs)).astype(np.float32)
-    nothing = np.zeros((70, envs, 1), np.float32)
-    made = decide(config, nothing, vex, jax.random.key(0), hypers_of(config))
+    made = decide(config, scored(vex), jax.random.key(0), hypers_of(config))
     medians, keep, rollouts = by_hand(config, vex)
     assert made.keep.tolist() == keep and made.rollouts == rollouts and len(rollouts) > 1
     np.testing.assert_allclose(made.median, medians, rtol=1e-6)
@@ -112,6 +111,12 @@ def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) ->
     np.testing.assert_array_equal(
         made.prediction, vex.mean(1) if decision == "joint" else vex[:, 0]
     )
+
+
+def scored(vex: np.ndarray) -> ScoredStep:
+    """Steps of which only the Vex prediction `[L, N]` is read."""
+    none = np.zeros(vex.shape, np.float32)
+    return ScoredStep(none[..., None], none[..., None], none, none, vex)
 
 
 def test_lost_lives_and_signs_are_what_is_learned() -> None:
@@ -136,26 +141,26 @@ def test_decisions_are_the_collectors(arm) -> None:
     more = {"drop_rate": 0.4} if arm == "random-drop" else {"threshold": THRESHOLD}
     config = configured(arm=arm, rollout_steps=64, minibatches=1, **more)
     vex = np.random.default_rng(1).normal(size=(40, 1)).astype(np.float32)
-    seen, key, hypers = np.zeros((40, 1, 1)), jax.random.key(7), hypers_of(config)
-    made = decide(config, seen, vex, key, hypers)
+    steps, key, hypers = scored(vex), jax.random.key(7), hypers_of(config)
+    made = decide(config, steps, key, hypers)
     filter, first = make_filter(config), jax.random.fold_in(key, 0)
     assert filter is not None
-    stretch = jax.jit(partial(decide_stretch, filter))
+    segment = jax.jit(partial(decide_segment, filter))
     state, rows = filter.init(1, capacity(config)), (np.int32(0), np.int32(40))
-    _, mask = stretch(state, seen, vex, *rows, first, hypers)
+    _, mask = segment(state, steps, *rows, first, hypers)
     assert made.keep.tolist() == np.asarray(mask)[:, 0].tolist() and 0 < made.keep.sum() < 40
 
 
 def test_without_a_filter_everything_is_kept() -> None:
     config = configured(arm="ppo", rollout_steps=16, minibatches=1)
-    made = decide(config, np.zeros((40, 1, 1)), np.ones((40, 1)), None, hypers_of(config))
+    made = decide(config, scored(np.ones((40, 1))), None, hypers_of(config))
     assert made.keep.all() and np.isnan(made.median).all() and made.rollouts == [0, 16, 32]
 
 
-def test_a_held_keep_rate_has_an_edge_that_moves() -> None:
+def test_a_target_keep_rate_has_an_edge_that_moves() -> None:
     config = configured(arm="sauna", keep_rate_target=0.6, rollout_steps=64, minibatches=1)
     vex = np.random.default_rng(4).normal(size=(90, 1)).astype(np.float32)
-    made = decide(config, np.zeros((90, 1, 1)), vex, jax.random.key(0), hypers_of(config))
+    made = decide(config, scored(vex), jax.random.key(0), hypers_of(config))
     assert abs(made.keep.mean() - 0.6) < 0.05
     known = ~np.isnan(made.edge)
     assert known.sum() > 80
@@ -241,7 +246,7 @@ def test_advantages_over_kept_steps_are_the_updates() -> None:
     stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields))
     hypers = hypers_of(config)
     update = jax.jit(partial(make_batch, config=config, target=make_target(config)))
-    batch = update(stream, hypers)
+    batch = update(stream, hypers, jax.random.key(0))
     made = advantages(config, stream, [0], hypers)
     np.testing.assert_allclose(made[keep[:, 0]], batch.advantage, rtol=1e-5, atol=1e-6)
     assert np.isnan(made[~keep[:, 0]]).all()
