@@ -357,7 +357,7 @@ def test_the_title_is_the_question_and_the_first_sentence_its_answer(tmp_path, r
     body = page.text[page.text.index(title, page.text.index(title) + 1) :]  # behind <title>
     better = [v for v in summary["verdicts"] if v["kind"] == "better"]
     assert [(v["label"], v["task"]) for v in better] == [("sauna 0.8", "HalfCheetah-v5")]
-    answer = "sauna 0.8 on HalfCheetah-v5: better; 5 of 6 comparisons: no evidence of a difference."
+    answer = "Better: sauna 0.8 on HalfCheetah-v5; no evidence of a difference: 5 of 6 comparisons."
     assert body[len(title) :].lstrip().startswith(answer)
     own = make_results(tasks=("Reacher-v5",), seeds=1)
     own["cells"] = own["cells"][:2]

@@ -82,6 +82,11 @@ def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
         "Threshold, exploration and return",
         plots(measured),
         looks(),
+        answer=" ".join(
+            _verdict(task, found).split(" With a ")[0]
+            for task in tasks_of(measured)
+            if (found := marks(measured, task))
+        ),
     )
 
 

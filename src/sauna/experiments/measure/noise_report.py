@@ -35,6 +35,7 @@ FORMER_KEYS = {
     "kept - control": "kept - coin",
 }
 TITLE = "Is what the filter drops noisier than random steps?"
+NOISIER, LESS_NOISY = "is noisier than", "is less noisy than"
 ABOUT = (
     "At checkpoints along training, with policy, head and normaliser as in the checkpoint: the "
     "policy gradient of minibatches of kept steps, of dropped ones, of steps that a matched random "
@@ -107,6 +108,7 @@ def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
         "Noise of minibatch gradients",
         plots(measured),
         looks(),
+        answer=_answer(measured),
     )
 
 
@@ -250,6 +252,24 @@ def verdicts(measured: Mapping[str, Any]) -> list[str]:
     return [_verdict(cell) for cell in measured["cells"]]
 
 
+def _answer(measured: Mapping[str, Any]) -> str:
+    """Counts the arms and tasks by what is found of them; empty before anything is."""
+    cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
+    if not cells:
+        return ""
+    by_variance = [_kind(_ratio(c, "dropped - control", raw=True), 1.0, noisier=1) for c in cells]
+    by_signal = [
+        _kind(over_members(c, "differences", "dropped - control", "snr"), 0.0, noisier=-1)
+        for c in cells
+    ]
+    said = [
+        f"by {name} noisier in {kinds.count(NOISIER)}, less noisy in {kinds.count(LESS_NOISY)} of "
+        f"{len(cells)} pairs of a task and an arm"
+        for name, kinds in (("variance", by_variance), ("signal to noise", by_signal))
+    ]
+    return f"What the filter drops is {said[0]}, {said[1]}."
+
+
 def _verdict(cell: Mapping[str, Any]) -> str:
     points = [*_points(cell)]
     measured = [point for point in points if rule(point)]
@@ -289,7 +309,7 @@ def _kind(estimate: Estimate, equal: float, noisier: int) -> str:
         return "is underpowered to be compared with"
     if estimate.low <= equal <= estimate.high:
         return "shows no difference from"
-    return "is noisier than" if (estimate.low > equal) == (noisier > 0) else "is less noisy than"
+    return NOISIER if (estimate.low > equal) == (noisier > 0) else LESS_NOISY
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:

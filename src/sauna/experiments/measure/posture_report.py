@@ -139,15 +139,17 @@ def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
     Args:
       folder: the study's, where `figures/frames.png` is written if there are frames.
     """
+    answers = verdicts(measured)
     return Section(
         TITLE,
-        verdicts(measured),
+        answers,
         ABOUT,
         text_table(measured),
         "Postures",
         plots(measured),
         style.looks({cell["label"]: cell["arm"] for cell in measured["cells"]}),
         _frames(measured, folder) if folder else None,
+        answer=answers[-1],
     )
 
 

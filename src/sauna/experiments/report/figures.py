@@ -69,6 +69,7 @@ class Section(NamedTuple):
       table_name: for readers who hear the page.
       plots, looks: figures, and how their lines look.
       image: a picture.
+      answer: one sentence; by default the first of `answers`.
     """
 
     title: str = ""
@@ -79,6 +80,7 @@ class Section(NamedTuple):
     plots: Sequence[Plot] = ()
     looks: Mapping[str, style.Look] = MappingProxyType({})
     image: SectionImage | None = None
+    answer: str = ""
 
 
 NOTHING = Section()

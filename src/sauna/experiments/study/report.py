@@ -31,6 +31,13 @@ MARKS = {
     "underpowered": "\N{HORIZONTAL ELLIPSIS}",
     "too many failed": "\N{MULTIPLICATION SIGN}",
 }
+ANSWERS = {
+    "better": "better",
+    "worse": "worse",
+    "no evidence": "no evidence of a difference",
+    "underpowered": "too few seeds to decide",
+    "too many failed": "too many seeds failed to decide",
+}
 UNFOLDED = 5  # verdicts that are shown with all their words
 
 
@@ -104,41 +111,37 @@ def question(results: Mapping[str, Any], section: Section = NOTHING) -> str:
     if not others:
         return f"How well does {baseline} do on {where}?"
     if len(others) > 3:
-        return f"Which of {len(others)} arms is better than {baseline} on {where}?"
+        bases = {cell.get("baseline") for cell in results["cells"]} - {None, baseline}
+        than = "the arm it is compared with" if bases else baseline
+        return f"Which of {len(others)} arms is better than {than} on {where}?"
     verb = "Is" if len(others) == 1 else "Are"
     return f"{verb} {_listed(others)} better than {baseline} on {where}?"
 
 
 def answer(summary: Mapping[str, Any], section: Section = NOTHING) -> str:
     """Returns the page's first sentence: what the verdicts come to."""
-    if section.title and section.answers:
-        return section.answers[0]
+    if section.title and (section.answer or section.answers):
+        return section.answer or section.answers[0]
     found = summary["verdicts"]
     if not found:
         return "Nothing is compared: there is no arm beside the baseline."
+    usual = Counter(verdict["against"] for verdict in found).most_common(1)[0][0]
     many = len({verdict["task"] for verdict in found}) > 1
     said = []
-    for kind, words in (("better", "better"), ("worse", "worse")):
-        names = [_named(v, many) for v in found if v["kind"] == kind]
+    for kind, words in ANSWERS.items():
+        names = [_named(v, usual, many) for v in found if v["kind"] == kind]
+        if kind not in ("better", "worse") and len(names) > 3:
+            names = [f"{len(names)} of {len(found)} comparisons"]
         if names:
-            said.append(f"{_listed(names)}: {words}")
-    for kind, words in (
-        ("no evidence", "no evidence of a difference"),
-        ("underpowered", "too few seeds to decide"),
-        ("too many failed", "too many seeds failed to decide"),
-    ):
-        names = [_named(v, many) for v in found if v["kind"] == kind]
-        if len(names) > 3:
-            said.append(f"{len(names)} of {len(found)} comparisons: {words}")
-        elif names:
-            said.append(f"{_listed(names)}: {words}")
+            said.append(f"{words}: {_listed(names)}")
     text = "; ".join(said) + "."
-    return text[0].upper() + text[1:] if said[0].startswith("no ") else text
+    return text[0].upper() + text[1:]
 
 
-def _named(verdict: Mapping[str, Any], many: bool) -> str:
-    """The arm of a verdict, with its task if there are several."""
-    return f"{verdict['label']} on {verdict['task']}" if many else str(verdict["label"])
+def _named(verdict: Mapping[str, Any], usual: str, many: bool) -> str:
+    """The arm of a verdict; what it is compared with if that is not usual, its task if of many."""
+    than = "" if verdict["against"] == usual else f" (than {verdict['against']})"
+    return f"{verdict['label']}{than}" + (f" on {verdict['task']}" if many else "")
 
 
 def _listed(names: Sequence[str]) -> str:
