@@ -46,9 +46,10 @@ def kept_first(keep: Array, permutation: Array) -> tuple[Array, Array]:
     Returns:
       the rows `[M]` and how many of them are kept.
     """
-    kept = keep[permutation]
-    number = jnp.sum(kept, dtype=jnp.int32)
-    place = jnp.where(kept, jnp.cumsum(kept) - 1, number + jnp.cumsum(~kept) - 1)
+    kept = keep[permutation].astype(jnp.int32)
+    number = jnp.sum(kept)
+    before = jnp.cumsum(kept) - kept  # kept rows in front of each
+    place = jnp.where(kept > 0, before, number + jnp.arange(len(keep)) - before)
     return jnp.zeros_like(permutation).at[place].set(permutation), number
 
 

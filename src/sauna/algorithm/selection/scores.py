@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.types import Array
@@ -24,5 +25,11 @@ def ranks(score: Array, eligible: Array) -> Array:
 
 
 def largest(score: Array, count: int | Array, eligible: Array) -> Array:
-    """Marks the `count` eligible rows of largest score."""
-    return (ranks(score, eligible) < count) & eligible
+    """Marks the `count` eligible rows of largest score; where scores tie, the lower rows.
+
+    If the count is static, no full sort is needed.
+    """
+    if not isinstance(count, int):
+        return (ranks(score, eligible) < count) & eligible
+    _, found = jax.lax.top_k(jnp.where(eligible, score, -jnp.inf), count)
+    return jnp.zeros(len(score), bool).at[found].set(True) & eligible
