@@ -204,7 +204,7 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in run_directory.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
-    command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-pictures"]
+    command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-frames"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (page,) = (tmp_path / "run").glob("inspect_*.html")

@@ -103,7 +103,7 @@ BAD = [
     (["eval", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
     (["inspect", "nothere"], "nothere is not a run directory"),
     (["inspect", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
-    (["inspect", "nothere", "--pictures"], "did you mean '--no-pictures'?"),
+    (["inspect", "nothere", "--frames"], "did you mean '--no-frames'?"),
     (["list", "foo"], "invalid choice"),
     (["trian", WORLD], "invalid choice: 'trian'"),
 ]

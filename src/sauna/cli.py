@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | study | bench | list`.
+"""The command line: `sauna train | resume | eval | inspect | compare | plot | study | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -96,7 +96,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate.add_argument("--deterministic", action="store_true", help=text)
     evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
-    evaluate.add_argument("--video", action="store_true", help="film the first episode")
+    evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
@@ -108,12 +108,13 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     inspect.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
-    text = "leave the pictures out: needs no renderer"
-    inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
+    inspect.add_argument("--no-frames", action="store_false", dest="frames", help="draw nothing")
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
-    compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
+    text = f"{FIELDS['env'].metadata['help']}; or runs that exist, as `plot` reads them"
+    compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
+    compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=text)
@@ -121,14 +122,19 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     filtered = {**shown_values(arguments, "sauna"), "seeds": COMPARED_SEEDS}
     add_fields(compare, free, filtered)
 
-    study = commands.add_parser(
-        "study", help="run a study of the paper's, or your own", allow_abbrev=False
-    )
+    text = "run a study of the paper's, or your own"
+    study = commands.add_parser("study", help=text, allow_abbrev=False)
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
     for command in (compare, study):
         place = command.add_argument_group("where it trains")
         for name, how in _PLACE.items():
             place.add_argument(flag(name), **how)
+
+    text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
+    plot = commands.add_parser("plot", help=text, allow_abbrev=False)
+    plot.add_argument("runs", nargs="+", metavar="RUN")
+    plot.add_argument("--out", default="", metavar="FILE", help="the figure, .png or .svg")
+    plot.add_argument("--tag", default="", help="of the returns in TensorBoard files")
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, usage=usage % "bench", allow_abbrev=False)
@@ -293,15 +299,27 @@ def _whole(values: dict[str, Any], name: str, least: int) -> int:
 
 
 def _compare(values: dict[str, Any]) -> None:
+    from sauna.experiments.report.sources import is_source
     from sauna.experiments.study.command import compare_command, comparison
+    from sauna.experiments.study.existing import compare_existing
 
-    env, arms = values.pop("env"), tuple(values.pop("arms").split(","))
+    names, tag = values.pop("env"), values.pop("tag")
+    if len(names) > 1 or tag or any(is_source(Path(name)) for name in names):
+        print("\n".join(compare_existing([*map(Path, names)], tag, **values)))
+        return
+    env, arms = names[0] if names else "", tuple(values.pop("arms").split(","))
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
     values = translate(values)
     spec = comparison(env, arms, parse_all(values))
     _run_study(spec, compare_command(env, arms, values, place["out"]), **place)
+
+
+def _plot(values: dict[str, Any]) -> None:
+    from sauna.experiments.report.curve import plot
+
+    print(f"figure: {plot([*map(Path, values['runs'])], values['out'], values['tag'])}")
 
 
 def _study(values: dict[str, Any]) -> None:
@@ -321,7 +339,7 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
     if not any(row["seeds"] for row in summary["table"]):
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
     if number := summary.get("not_measured"):
-        log = Path(out) / spec.name / spec.measure / "stderr.txt"
+        log = spec.measurement.folder(Path(out) / spec.name) / "stderr.txt"
         raise SaunaError(
             f"{number} members are not measured; what is said above, and {log}, say why"
         )
@@ -362,13 +380,9 @@ def _bench(values: dict[str, Any]) -> None:
     elif scale:
         result = bench_scale(overrides, rounds, _say)
     else:
+        path = Path(script) if script else None
         result = bench(
-            overrides,
-            rounds=rounds,
-            iterations=iterations,
-            against=against,
-            script=Path(script) if script else None,
-            say=_say,
+            overrides, rounds=rounds, iterations=iterations, against=against, script=path, say=_say
         )
         print("\n".join(report(result)))
     if file:
@@ -429,6 +443,7 @@ _COMMANDS = {
     "eval": _eval,
     "inspect": _inspect,
     "compare": _compare,
+    "plot": _plot,
     "study": _study,
     "bench": _bench,
     "list": _list,

@@ -23,7 +23,9 @@ from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
 from sauna.config.settings import parse
 from sauna.envs.spaces import describe
-from sauna.experiments.study.command import _check_measurable, compare_command, comparison
+from sauna.experiments.measure.measurement import find_measurement
+from sauna.experiments.report import style
+from sauna.experiments.study.command import compare_command, comparison
 from sauna.experiments.study.execute.process import UnitProcess
 from sauna.experiments.study.results import _ended
 from sauna.experiments.study.spec import built_in, check, load_spec, read_spec
@@ -116,21 +118,20 @@ def test_the_advice_about_checkpoints_can_be_taken(given: dict, advice: tuple) -
     assert read_spec({**text, "checkpoint_every": every, "keep_checkpoints": kept}).measure
 
 
-def test_pictures_are_not_measured() -> None:
+def test_images_are_not_measured() -> None:
     config = check(read_spec(TWO).arms[1], "A-v0")
     spaces = describe(Box(0, 255, (84, 84, 4), np.uint8), Discrete(3))
-    for measure, changed in (("noise", {}), ("dial", {"normalize_observations": False})):
-        spec = read_spec(TWO)._replace(measure=measure)
+    for measure, changed in (("noise", {}), ("coverage", {"normalize_observations": False})):
         with pytest.raises(BadInput, match=f"measure: {measure}"):
-            _check_measurable(spec, dataclasses.replace(config, **changed), spaces)
-    _check_measurable(read_spec(TWO)._replace(measure="dial"), config, spaces)
+            find_measurement(measure).check_spaces(dataclasses.replace(config, **changed), spaces)
+    find_measurement("coverage").check_spaces(config, spaces)
 
 
-def test_the_area_is_that_of_the_budget() -> None:
+def test_the_auc_is_that_of_the_budget() -> None:
     rows = [{"env_steps": n, "return_mean": float(n)} for n in (100, 200, 300, 400)]
-    assert _ended(rows, 300)["area"] == 200.0
-    assert _ended(rows, 400)["area"] == 250.0
-    assert _ended([], 400)["area"] is None
+    assert _ended(rows, 300)["auc"] == 200.0
+    assert _ended(rows, 400)["auc"] == 250.0
+    assert _ended([], 400)["auc"] is None
 
 
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ def inspect(
     deterministic: bool = False,
     seed: int = 0,
     out: str | Path | None = None,
-    pictures: bool = True,
+    frames: bool = True,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Plays episodes with a member's policy and writes one self-contained page about them.
@@ -28,8 +28,8 @@ def inspect(
       episodes: played one after the other, with seeds `seed`, `seed + 1`, ...
       deterministic: the distribution's mode; otherwise actions are sampled, as in training.
       out: the page; default `RUN/inspect_MEMBER_MODE.html`.
-      pictures: draw the environment; where that fails, one line says so and the page has none.
-      say: is told of checkpoints that cannot be trusted, and of missing pictures.
+      frames: draw the environment; where that fails, one line says so and the page has none.
+      say: receives a line for each checkpoint that cannot be trusted, and for missing frames.
 
     Returns:
       the page.
@@ -49,6 +49,6 @@ def inspect(
     from sauna.experiments.inspect.inspection import examine  # imports JAX, so after the checks
     from sauna.experiments.inspect.page import make_page
 
-    found = examine(run, artifact, name, episodes, deterministic, seed, pictures, say)
+    found = examine(run, artifact, name, episodes, deterministic, seed, frames, say)
     path.write_text(make_page(found, run), encoding="utf-8")
     return path

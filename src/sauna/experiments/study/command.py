@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import COMPARED_SEEDS, algorithm_of, chosen_preset
-from sauna.config.settings import Config
 from sauna.envs.probe import Probe
-from sauna.envs.spaces import Spaces
 from sauna.experiments.report.numbers import digits_of_tasks, interval, number
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
@@ -24,7 +22,7 @@ from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
-from sauna.experiments.study.summary import FILTERING, summarize
+from sauna.experiments.study.summary import ABLATION, summarize
 from sauna.experiments.study.units import (
     Unit,
     digest_of,
@@ -40,7 +38,7 @@ from sauna.training.prepare import examine, look_at, place
 
 
 def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
-    """The study that `sauna compare ENV` runs: its folder is named after its settings.
+    """Returns the study that `sauna compare ENV` runs: its folder is named after its settings.
 
     Raises:
       BadInput: unknown arms or settings that cannot be used.
@@ -61,13 +59,13 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
 def compare_command(
     env: str, arms: tuple[str, ...], settings: Mapping[str, Any], out: str | Path
 ) -> str:
-    """What a user types to make the same comparison again."""
+    """Returns what a user types to make the same comparison again."""
     flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
     return f"sauna compare {shlex.quote(env)} --arms {','.join(arms)}{flags}{_typed_out(out)}"
 
 
 def study_command(name: str, out: str | Path) -> str:
-    """What a user types to run the study again."""
+    """Returns what a user types to run the study again."""
     return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
 
 
@@ -140,23 +138,10 @@ def _check_runs(spec: Spec) -> None:
                 found[key] = look_at(config)
             try:
                 prepared = examine(placed, arm.checked_overrides(task), found[key])
-                _check_measurable(spec, prepared.config, prepared.spaces)
+                if spec.measurement:
+                    spec.measurement.check_spaces(prepared.config, prepared.spaces)
             except BadInput as error:
                 raise BadInput(f"arm {arm.label!r}: {error}") from None
-
-
-def _check_measurable(spec: Spec, config: Config, spaces: Spaces) -> None:
-    """Refuses what only an environment's spaces tell of a measurement."""
-    if spec.measure == "dial" and not config.normalize_observations:
-        raise BadInput(
-            "measure: dial takes its scale from the normaliser of observations, which "
-            f"{config.env} does not have"
-        )
-    if spec.measure == "noise" and spaces.observation_kind == "image":
-        raise BadInput(
-            "measure: noise keeps rollouts of observations in memory, which pictures "
-            "are too large for"
-        )
 
 
 def _on_gpu(spec: Spec) -> bool:
@@ -177,7 +162,7 @@ def _train(
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
     size = _unit_size(spec, place, jobs)
-    with _held(folder):
+    with _locked(folder):
         _note(spec, place, size)
         units = units_of(spec, size)
         view = StudyView(spec, units, folder, quiet)
@@ -221,8 +206,8 @@ def _note_signal(noted: list[int], number: int) -> None:
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """The folder of units, made and held: one study at a time."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Makes and locks the folder of units: one study at a time."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -267,46 +252,38 @@ def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:
 
 def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
     """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
-    from sauna.experiments.measure import coverage_report, noise_report, posture_report
     from sauna.experiments.report.figures import NOTHING
     from sauna.experiments.study.report import write_report
 
     results = gather(spec, units, folder, command)
     summary = summarize(results)
-    extra = NOTHING
-    if spec.measure:
+    section = NOTHING
+    if measurement := spec.measurement:
         measured = gather_measured(spec, units, folder, place, results)
-        run_directory.write_json(place / f"{spec.measure}.json", measured)
-        study = {"noise": noise_report, "dial": coverage_report, "torso": posture_report}[
-            spec.measure
-        ]
-        summary["measured"] = study.verdicts(measured)
+        run_directory.write_json(place / f"{measurement.name}.json", measured)
+        section = measurement.report(measured, place)
+        summary["measured"] = list(section.answers)
         summary["not_measured"] = sum(
             not item.is_done for item in items_of(spec, units, folder, place)
         )
-        extra = (
-            posture_report.extra(measured, place)
-            if study is posture_report
-            else study.extra(measured)
-        )
     run_directory.write_json(place / "results.json", results)
     run_directory.write_json(place / "summary.json", summary)
-    write_report(results, summary, place, extra)
+    write_report(results, summary, place, section)
     return summary
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
-    """The table and the verdicts, as text."""
+    """Returns the table and the verdicts, as text."""
     head = [
         "task",
         "arm",
         "seeds",
         "final return, IQM",
-        "area, IQM",
+        "AUC, IQM",
         "mean +- std",
         "keep rate",
         "env steps",
-        "P(better)",
+        "P(improvement)",
     ]
     digits = digits_of_tasks(summary["table"])
     rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
@@ -314,7 +291,8 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
     said = [v["text"] for v in summary["verdicts"]]
     if summary["filtering"]:
-        said += ["", "Is it the filter? " + FILTERING, *(v["text"] for v in summary["filtering"])]
+        ablation = "Ablation of the selection rule. " + ABLATION
+        said += ["", ablation, *(v["text"] for v in summary["filtering"])]
     said += summary.get("measured", [])
     return [*(line.rstrip() for line in table), "", *said]
 
@@ -327,7 +305,7 @@ def _row(row: Mapping[str, Any], digits: int) -> list[str]:
         row["label"],
         f"{row['seeds']}{failed}",
         interval(row["final_iqm"], digits),
-        interval(row["area_iqm"], digits),
+        interval(row["auc_iqm"], digits),
         f"{mean} +- {std}",
         number(row["keep_rate"], 3),
         number(row["env_steps"], 0),

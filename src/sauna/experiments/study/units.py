@@ -38,7 +38,7 @@ class Unit(NamedTuple):
     source: str | None
 
     def run(self, folder: Path) -> Path:
-        """The run directory."""
+        """Returns the run directory."""
         return folder / self.name / "run"
 
     def overrides(self, folder: Path) -> dict[str, Any]:
@@ -49,7 +49,7 @@ class Unit(NamedTuple):
         return overrides
 
     def error(self, folder: Path) -> str | None:
-        """Why it failed for good, or None."""
+        """Returns why it failed for good, or None."""
         path = folder / self.name / "failed.json"
         return str(json.loads(path.read_text())["error"]) if path.is_file() else None
 
@@ -58,8 +58,9 @@ class Unit(NamedTuple):
 
 
 def seeds_per_unit(spec: Spec, cores: int) -> int:
-    """As many as share a process well, or fewer where cores would stay idle at the start, when arms
-    that repeat others' drop rates have to wait; as even as can be without another unit."""
+    """Returns as many as share a process well, or fewer where cores would stay idle at the start,
+    when arms that repeat others' drop rates have to wait; as even as can be without another
+    unit."""
     first = [arm for arm in spec.arms if arm.rates_of is None]
 
     def units(size: int) -> int:
@@ -70,12 +71,13 @@ def seeds_per_unit(spec: Spec, cores: int) -> int:
 
 
 def most_seeds(spec: Spec) -> int:
-    """All seeds of an arm: a GPU trains them in little more time than one."""
+    """Returns all seeds of an arm: a GPU trains them in little more time than one."""
     return max(len(arm.seeds) for arm in spec.arms)
 
 
 def units_of(spec: Spec, size: int) -> list[Unit]:
-    """All units of `size` seeds at most, arm by arm, a source before those that repeat it."""
+    """Returns all units of `size` seeds at most, arm by arm, a source before those that repeat
+    it."""
     arms = {arm.label: arm for arm in spec.arms}
     ordered = sorted(spec.arms, key=lambda arm: arm.rates_of is not None)
     return [
@@ -108,7 +110,7 @@ def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
 
 
 def study_identity(spec: Spec) -> list[Any]:
-    """Everything that a study trains and compares: the same for the same study."""
+    """Returns everything that a study trains and compares: the same for the same study."""
     return [
         [arm.label, arm.baseline, arm.rates_of, identity(arm, task, arm.seeds)]
         for arm in spec.arms
@@ -117,12 +119,13 @@ def study_identity(spec: Spec) -> list[Any]:
 
 
 def digest_of(values: Any) -> str:
-    """A name for JSON values."""
+    """Returns a name for JSON values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
 def split(unit: Unit, folder: Path) -> list[Unit]:
-    """A unit of several seeds as units of one: so that the others go on where one failed."""
+    """Returns a unit of several seeds as units of one: so that the others go on where one
+    failed."""
     source_is_split = unit.source is not None and _is_split(folder / unit.source)
     return [
         unit._replace(
@@ -146,11 +149,11 @@ def _is_split(place: Path) -> bool:
 
 
 def parts(unit: Unit, folder: Path) -> list[Unit]:
-    """The units that hold the runs: the unit itself, or one per seed where it was split."""
+    """Returns the units that hold the runs: the unit itself, or one per seed where it was split."""
     is_split = _is_split(folder / unit.name) and not unit.is_complete(folder)
     return split(unit, folder) if is_split else [unit]
 
 
 def needs_split(unit: Unit, folder: Path) -> bool:
-    """Whether its source was split, so that it has to follow."""
+    """Returns whether its source was split, so that it has to follow."""
     return len(unit.seeds) > 1 and unit.source is not None and _is_split(folder / unit.source)

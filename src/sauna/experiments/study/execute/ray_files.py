@@ -28,7 +28,7 @@ class Changes(NamedTuple):
 
 
 def names(place: Path) -> list[str]:
-    """The files of the unit in `place`, without those that are being written."""
+    """Returns the files of the unit in `place`, without those that are being written."""
     found = [place / "stderr.txt", *sorted((place / "run").rglob("*"))]
     relative = [path.relative_to(place) for path in found if path.is_file()]
     return [str(r) for r in relative if not any(part.startswith(".") for part in r.parts)]
@@ -46,7 +46,7 @@ def write(place: Path, files: dict[str, bytes]) -> None:
 
 
 def checkpoints(place: Path) -> list[str]:
-    """The finished checkpoints of the unit in `place`, oldest first."""
+    """Returns the finished checkpoints of the unit in `place`, oldest first."""
     return sorted(p.name for p in (place / CHECKPOINTS).glob("[0-9]" * 8))
 
 
@@ -63,7 +63,7 @@ class Tracker:
         return found.st_mtime_ns, found.st_size
 
     def changes(self) -> Changes:
-        """Everything that changed since the last call; the run may go on meanwhile."""
+        """Returns everything that changed since the last call; the run may go on meanwhile."""
         while True:
             try:
                 return self._changes()

@@ -1,4 +1,4 @@
-"""One unit of a study, as a process: trains or resumes a run and tells its progress.
+"""One unit of a study, as a process: trains or resumes a run and reports its progress.
 
     python -m sauna.experiments.study.execute.unit_process < settings
 
@@ -30,7 +30,7 @@ from sauna.system.errors import Interrupted, SaunaError
 from sauna.training import run as runs
 from sauna.training.train import train_run
 
-PATIENCE = 300.0  # seconds that a run may still be held by a process that is ending
+PATIENCE = 300.0  # seconds that a run may still be locked by a process that is ending
 SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate")
 
 
