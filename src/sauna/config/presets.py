@@ -7,6 +7,7 @@ A preset says how an algorithm trains; an arm says which transitions the update 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -68,6 +69,16 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 PRESETS["a2c-atari"] = {**PRESETS["a2c"], "sign_rewards": True, "normalize_rewards": False}
 PRESETS["a2c-mujoco"] = {**PRESETS["a2c"], "entropy_coef": 0.0, "trunk": "separate"}
+
+# Tasks with published results: MuJoCo's actions stay in the robot's own units, as there, if nobody
+# says otherwise (the other tasks here have boxes of [-1, 1], or no boxes).
+PUBLISHED = re.compile(
+    r"^(?:ALE|sauna|mjx|brax|playground)/|^gymnax/.*-MinAtar$|"
+    r"^(?:[\w.]+:)?(?:Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum|"
+    r"InvertedPendulum|Pusher|Reacher|Swimmer|Walker2d)-v\d+$"
+)
+# What was done before a field existed, if that is not its default.
+BEFORE = {"rescale_actions": False}
 
 # The preset of an algorithm where none is named.
 FIRST = {"ppo": "mujoco", "a2c": "a2c"}
@@ -248,7 +259,8 @@ def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
     """Defaults < preset < arm < what the user gave and the arm does not fix; not checked."""
     preset = chosen_preset(parsed)
     own = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
-    settings = {**PRESETS[preset], **ARMS[arm], **own, "preset": preset}
+    of_env = {"rescale_actions": False} if PUBLISHED.match(parsed.get("env", "")) else {}
+    settings = {**of_env, **PRESETS[preset], **ARMS[arm], **own, "preset": preset}
     return dataclasses.replace(Config(), **settings)
 
 
@@ -274,13 +286,12 @@ def _check_same_program(arm: str, config: Config, shared: Config) -> None:
 def stored_config(stored: Mapping[str, Any]) -> Config:
     """The config that `config.to_json` wrote, perhaps before some fields existed.
 
-    A field that is missing has its default: whoever adds one sees to it that its default is what
-    was done before.
+    A field that is missing has its default, or what was done before it existed (`BEFORE`).
 
     Raises:
       BadInput: a key is unknown, or a value cannot be read.
     """
-    return Config(**parse_all(stored))
+    return Config(**parse_all({**BEFORE, **stored}))
 
 
 def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -290,7 +301,8 @@ def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, A
     The run directory is left out, as a new run takes a new one, and the number of processes that
     the machine decided.
     """
-    drift = {name: value for name, value in _drifted(stored, given).items() if name != "processes"}
+    drift = _drifted({**BEFORE, **stored}, given)
+    drift.pop("processes", None)
     return {name: value for name, value in {**given, **drift}.items() if name != "out"}
 
 
@@ -299,7 +311,7 @@ def as_began(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, A
 
     Members take their own values from it; `stored` is the config that the run began with.
     """
-    drift = _drifted({**to_json(Config()), **stored}, given)
+    drift = _drifted({**to_json(Config()), **BEFORE, **stored}, given)
     kept = {name: value for name, value in drift.items() if name not in (*RESUMABLE, *SETTLED)}
     return {**given, **kept}
 

@@ -158,7 +158,10 @@ class Config:
     )
 
     network: str = option(
-        "auto", "trunk (auto: nature-cnn for images, else mlp)", choices=NETWORKS, plugin=True
+        "auto",
+        "trunk (auto: nature-cnn for images of 36 x 36 pixels or more, else mlp)",
+        choices=NETWORKS,
+        plugin=True,
     )
     hidden: tuple[int, ...] = option((64, 64), "widths of the MLP's hidden layers", at_least=1)
     activation: str = option("tanh", "the MLP's activation", choices=("tanh", "relu"))
@@ -166,6 +169,11 @@ class Config:
         "separate", "whether policy and value share a trunk", choices=("separate", "shared")
     )
     log_std_init: float = option(0.0, "first log standard deviation of continuous actions")
+    rescale_actions: bool = option(
+        True,
+        "stretch actions in [-1, 1] to the bounds of the action box (MuJoCo's tasks: no, as "
+        "published)",
+    )
     normalize_observations: bool = option(
         True, "running mean and variance of vector observations (images are divided by 255)"
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import RESUMABLE
+from sauna.config.presets import BEFORE, RESUMABLE
 from sauna.config.settings import Config, to_json
+from sauna.envs.spaces import read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.training.coordinator import Coordinator
@@ -82,15 +82,16 @@ def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> No
     Raises:
       BadInput: with every field that differs.
     """
-    stored = {**to_json(Config()), **manifest["config"]}  # a field added since had its default
+    stored = {**to_json(Config()), **BEFORE, **manifest["config"]}
     differing = [
         f"{name} is {stored[name]!r}, not {value!r}"
         for name, value in own["config"].items()
         if name not in (*RESUMABLE, "out") and stored[name] != value
     ]
-    for name in ("spaces", "members"):
-        if manifest[name] != json.loads(json.dumps(own[name])):
-            differing.append(f"{name} differ")
+    if read_spaces(manifest["spaces"]) != read_spaces(own["spaces"]):
+        differing.append("spaces differ")
+    if manifest["members"] != own["members"]:
+        differing.append("members differ")
     if differing:
         raise BadInput(
             f"{path}: its checkpoint is of another run or environment: {'; '.join(differing)}"

@@ -15,11 +15,13 @@ from sauna.algorithm.policy.normalize import Moments, scale_rewards
 from sauna.algorithm.types import Hypers, Rollout, member_keys
 from sauna.config.presets import Member, as_began, members
 from sauna.config.settings import Config
+from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
 from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.evaluate.video import frames_per_second
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
-from sauna.experiments.inspect.recording import Played, clock, open_world, play_episodes, play_steps
+from sauna.experiments.inspect.recording import Played, open_world, play_episodes, play_steps
 from sauna.system import run_directory
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under
@@ -57,6 +59,7 @@ def examine(
     deterministic: bool,
     seed: int,
     pictures: bool,
+    max_steps: int,
     say: Callable[[str], None],
 ) -> Inspection:
     """Plays, and computes what the page shows."""
@@ -67,9 +70,9 @@ def examine(
     kwargs = json.loads(config.env_kwargs)
     world, drawer = open_world(config.env, kwargs, pictures, say)
     policy = TrainedPolicy(artifact, name, world)
-    played = play_episodes(policy, world, episodes, deterministic, seed, drawer)
-    steps_per_second = clock(world)
-    world.close()
+    played = play_episodes(policy, world, episodes, deterministic, seed, drawer, max_steps)
+    steps_per_second = frames_per_second(world)
+    close(world)
     own = under(name + "/", artifact.checkpoint.arrays)
     hypers = hypers_of(run, config, everyone.index(member), iteration, own)
     steps, number = len(played.reward), environments(config)
@@ -77,7 +80,7 @@ def examine(
     for n in range(1, number):
         world = make_env(config.env, kwargs)
         seen.append(play_steps(policy, world, steps, deterministic, seed, n))
-        world.close()
+        close(world)
     value, own_vex = policy.predict(played.observation)
     vex = np.stack([own_vex, *(policy.predict(x)[1] for x in seen[1:])], 1)
     key = jax.random.fold_in(member_keys(member.seed).filter, iteration)
