@@ -102,6 +102,7 @@ def main() -> None:
     import safetensors.numpy
 
     import sauna.envs.host.gymnasium_envs
+    import sauna.envs.make
     import sauna.experiments.evaluate.artifact
     from sauna.system.errors import SaunaError
 
