@@ -215,8 +215,8 @@ def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
     bounded = (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)
-    center = np.where(bounded, (low + high) / 2, 0.0)
-    half = np.where(bounded, (high - low) / 2, 1.0)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    center, half = (low + high) / 2, (high - low) / 2
     if np.all(center == 0.0) and np.all(half == 1.0):
         return None
     return bounded, center, half

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.learner.vex_targets import make_target
-from sauna.algorithm.policy.policy import make_trunk
+from sauna.algorithm.policy.policy import check_collections, make_trunk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import Filter, Hypers
@@ -49,6 +49,7 @@ def _check_network(config: Config, spaces: Spaces) -> None:
             shape = (*lead, *spaces.observation_shape)
             seen = jax.ShapeDtypeStruct(shape, spaces.observation_dtype)
             variables = jax.eval_shape(module.init, key, seen)
+            check_collections(config, variables)
             given = jax.eval_shape(module.apply, variables, seen)
             if len(getattr(given, "shape", ())) != len(lead) + 1 or given.shape[:-1] != lead:
                 wanted = (*lead, "features")
@@ -58,8 +59,7 @@ def _check_network(config: Config, spaces: Spaces) -> None:
                 )
             if not jnp.issubdtype(given.dtype, jnp.floating):
                 raise BadInput(f"{field} gives {given.dtype}, instead of floating-point features")
-        if set(variables) <= {"params"}:  # others are refused by name, where the policy is made
-            _check_finite(field, module, key, spaces)
+        _check_finite(field, module, key, spaces)
     except BadInput:
         raise
     except Exception as error:  # a user's module fails in its own way

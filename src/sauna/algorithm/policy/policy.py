@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -73,7 +74,8 @@ def make_trunk(config: Config, spaces: Spaces) -> Callable[[str, nn.Module | Non
             why = f": calling it raises {one_line(error)}"
     if not isinstance(module, nn.Module):
         raise BadInput(f"network: {config.network} is not a flax.linen module{why}")
-    return lambda name, parent: module.clone(name=name, parent=parent)
+    # Copied with its parts: flax lets modules that hold the same instance share its parameters.
+    return lambda name, parent: copy.deepcopy(module).clone(name=name, parent=parent)
 
 
 def _named(make: Callable[..., nn.Module], name: str, parent: nn.Module | None) -> nn.Module:
@@ -111,7 +113,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     )
     example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
     variables = jax.eval_shape(network.init, jax.random.key(0), example)
-    _check_collections(config, variables)
+    check_collections(config, variables)
     unravel = _unraveler(variables)
 
     def init(key: Array) -> Array:
@@ -123,7 +125,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     return Policy(init, apply, unravel, distribution)
 
 
-def _check_collections(config: Config, variables: Params) -> None:
+def check_collections(config: Config, variables: Params) -> None:
     """Refuses a network with a state beside its parameters, which Adam must not train."""
     others = sorted(set(variables) - {"params"})
     if others:

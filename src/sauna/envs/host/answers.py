@@ -22,7 +22,8 @@ def one_number(reward: Any) -> float:
     if isinstance(reward, float | int):
         return float(reward)
     found = np.asarray(reward)
-    if found.size != 1 or not hasattr(found.reshape(-1)[0], "__float__"):
+    number = found.size == 1 and found.dtype.kind != "c"
+    if not number or not hasattr(found.reshape(-1)[0], "__float__"):
         what = f"of shape {found.shape}" if found.ndim else f"{reward!r:.40}"
         raise ValueError(f"the reward is {what}, not one number")
     return float(found.reshape(-1)[0])
