@@ -71,7 +71,9 @@ def test_other_environments_get_the_seed_as_it_is() -> None:
     numbers = [n for n in range(20) if episode_seed(0, 0, n) >= 2**31]
     assert numbers
     for n in numbers[:3]:
-        got = GymnasiumEnvs(worlds.Scripted, [(0, 0)]).start_after(0, {"episode": np.asarray(n - 1)})
+        got = GymnasiumEnvs(worlds.Scripted, [(0, 0)]).start_after(
+            0, {"episode": np.asarray(n - 1)}
+        )
         expected, _ = worlds.Scripted().reset(seed=episode_seed(0, 0, n))
         np.testing.assert_array_equal(got, expected)
 

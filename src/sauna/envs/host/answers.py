@@ -11,6 +11,7 @@ import numpy as np
 from sauna.system.errors import one_line
 
 MAX_SIGNED = 2**31 - 1  # the largest seed of a simulator that keeps it in a signed int
+_SAID: set[str] = set()  # warnings of this process
 
 
 def one_number(reward: Any) -> float:
@@ -66,8 +67,11 @@ def _is_of_seed(error: Exception, seed: int) -> bool:
 
 
 def close(env: Any, name: str = "the environment") -> None:
-    """Closes an environment; that it cannot be closed is said, and costs nothing else."""
+    """Closes an environment; that it cannot be closed is said once, and costs nothing else."""
     try:
         env.close()
     except (Exception, SystemExit) as error:
-        print(f"warning: {name} cannot be closed: {one_line(error)}", file=sys.stderr)
+        text = f"warning: {name} cannot be closed: {one_line(error)}"
+        if text not in _SAID:
+            print(text, file=sys.stderr)
+        _SAID.add(text)
