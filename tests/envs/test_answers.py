@@ -27,7 +27,7 @@ def test_one_number_in_any_form_is_that_number(reward: Any) -> None:
 
 @pytest.mark.parametrize("reward", [None, np.zeros(2), [], {}, 2j])
 def test_a_reward_that_is_not_one_number_is_refused(reward: Any) -> None:
-    with pytest.raises(ValueError, match="the reward is .*, not one number"):
+    with pytest.raises(ValueError, match=r"the reward is .*, not one number"):
         one_number(reward)
 
 
