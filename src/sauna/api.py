@@ -139,7 +139,7 @@ def compare(
             if is_local(given[name]):
                 raise BadInput(
                     f"{name}: other processes cannot import it; put it into a module, and give "
-                    "module:name"
+                    "module:name (or module:Id-v0, if importing it registers the id)"
                 )
     task = given.pop("env")
     spec = comparison(task, tuple(arms), parse_all(given))

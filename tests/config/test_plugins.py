@@ -80,14 +80,14 @@ def test_a_process_without_the_part_says_so(tmp_path: Path) -> None:
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "env: was passed by value; pass it again as env=" in done.stderr
     code = (
-        "import sauna, sys; sys.path.insert(0, {tests!r})\n"
+        f"import sauna, sys; sys.path.insert(0, {str(Path(__file__).parent.parent)!r})\n"
         "from worlds import Finite\n"
         "class Pays(Finite):\n"
         "    def reward(self, action): return 7.0\n"
-        "found = sauna.evaluate({out!r}, episodes=1, env=lambda: Pays())\n"
+        f"found = sauna.evaluate({str(out)!r}, episodes=1, env=lambda: Pays())\n"
         "print(found['members']['ppo/0']['mean'])\n"
-        "print(sauna.evaluate({out!r}, episodes=1)['members']['ppo/0']['mean'])"
-    ).format(out=str(out), tests=str(Path(__file__).parent.parent))
+        f"print(sauna.evaluate({str(out)!r}, episodes=1)['members']['ppo/0']['mean'])"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment()
     )

@@ -16,7 +16,7 @@ from sauna.system.errors import BadInput, nearest, one_line
 LOCAL = local.__name__
 STORED_BEFORE = "sauna.local"  # its name in the runs of 0.1.0
 PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
-_UNIQUE = re.compile(r"_[0-9a-f]{32}$")  # ends a part's name; older runs have names that may meet
+_UNIQUE = re.compile(r"_[0-9a-f]{16}$")  # ends a part's name; older runs have names that may meet
 
 
 def import_name(key: str, path: str) -> Any:
@@ -84,7 +84,7 @@ def name_of(thing: Any) -> str:
     if importable and getattr(sys.modules.get(str(module)), str(name), None) is thing:
         return f"{module}:{name}"
     name = "".join(c if c.isalnum() else "_" for c in name or type(thing).__name__)
-    name = f"{name}_{uuid.uuid4().hex}"
+    name = f"{name}_{uuid.uuid4().hex[:16]}"
     setattr(local, name, thing)
     return f"{LOCAL}:{name}"
 

@@ -46,6 +46,14 @@ def read_spaces(values: list[Any]) -> Spaces:
     return Spaces(*fields)
 
 
+def same_spaces(stored: Any, found: Spaces) -> bool:
+    """Whether a run's stored spaces are those that an environment has."""
+    try:
+        return read_spaces(stored) == read_spaces(list(found))
+    except TypeError:  # not what a run writes
+        return False
+
+
 def describe(observation_space: Any, action_space: Any) -> Spaces:
     """The `Spaces` of a Gymnasium environment.
 

@@ -116,6 +116,8 @@ def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str
     check_read([config], {name: given[name] for name in names if name in given})
     if "log_std_init" in given and spaces.action_kind != "continuous":
         raise BadInput(f"log_std_init: not read with {spaces.action_kind} actions")
+    if parse_all(given).get("rescale_actions") and spaces.action_kind != "continuous":
+        raise BadInput(f"rescale_actions: not read with {spaces.action_kind} actions")
     wanted = "normalize_observations" in given and resolve(given).normalize_observations
     if wanted and not config.normalize_observations:
         raise BadInput(

@@ -24,7 +24,7 @@ from sauna.config.presets import (
 )
 from sauna.config.settings import Config, local_parts, to_json
 from sauna.envs.probe import Probe
-from sauna.envs.spaces import read_spaces
+from sauna.envs.spaces import same_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
@@ -172,7 +172,7 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     _check_placement(config, changes)
     found = look_at(config)
     config = settle(config, found.spaces)
-    if read_spaces(stored["spaces"]) != read_spaces(list(found.spaces)):
+    if not same_spaces(stored["spaces"], found.spaces):
         raise BadInput(
             f"{config.env} has other spaces than when the run started: "
             f"{found.spaces} instead of {stored['spaces']}"

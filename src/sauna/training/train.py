@@ -7,7 +7,7 @@ from typing import Any
 
 from sauna.config.presets import BEFORE, RESUMABLE
 from sauna.config.settings import Config, to_json
-from sauna.envs.spaces import read_spaces
+from sauna.envs.spaces import read_spaces, same_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.training.coordinator import Coordinator
@@ -89,7 +89,7 @@ def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> No
         for name, value in own["config"].items()
         if name not in (*RESUMABLE, "out") and stored[name] != value
     ]
-    if read_spaces(manifest["spaces"]) != read_spaces(own["spaces"]):
+    if not same_spaces(manifest["spaces"], read_spaces(own["spaces"])):
         differing.append("spaces differ")
     if manifest["members"] != own["members"]:
         differing.append("members differ")

@@ -100,8 +100,7 @@ def evaluate(
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played)
-        if progress.cut:
-            say(f"{name}: {progress.cut} of {episodes} episodes were cut after {max_steps} steps")
+        progress.say_cut(max_steps)
     close(world)
     if env is None and member is None and checkpoint is None and not env_kwargs:
         run_directory.write_json(run / f"evaluation_{mode}.json", result)

@@ -73,3 +73,9 @@ class Progress:
     def played(self, episode: Episode) -> Episode:
         self._episode, self._steps, self.cut = self._episode + 1, -1, self.cut + episode.cut
         return episode
+
+    def say_cut(self, max_steps: int) -> None:
+        """At the end: says how many episodes had not ended."""
+        if self.cut:
+            how_many = f"{self.cut} of {self._episodes} episodes"
+            self._say(f"{self._name}: {how_many} were cut after {max_steps} steps")

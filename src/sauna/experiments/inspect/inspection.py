@@ -70,7 +70,7 @@ def examine(
     kwargs = json.loads(config.env_kwargs)
     world, drawer = open_world(config.env, kwargs, pictures, say)
     policy = TrainedPolicy(artifact, name, world)
-    played = play_episodes(policy, world, episodes, deterministic, seed, drawer, max_steps)
+    played = play_episodes(policy, world, episodes, deterministic, seed, drawer, max_steps, say)
     steps_per_second = frames_per_second(world)
     close(world)
     own = under(name + "/", artifact.checkpoint.arrays)

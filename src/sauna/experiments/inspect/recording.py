@@ -13,7 +13,7 @@ from sauna.envs.host.answers import life_lost, one_number
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.make import make_drawn_env, make_env
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.play import play
+from sauna.experiments.evaluate.play import Progress, play
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import choose_renderer, frames_per_second, not_drawn
 from sauna.system.errors import BadInput, SaunaError
@@ -141,13 +141,15 @@ def play_episodes(
     seed: int,
     pictures: Pictures | None,
     max_steps: int = MAX_STEPS,
+    say: Callable[[str], None] = print,
 ) -> Played:
     """The episodes that `evaluate` plays with this seed."""
     recorder = Recorder(env, policy, pictures, max_steps)
-    returns = [
-        play(policy, recorder, deterministic, seed + i, max_steps=max_steps).return_
-        for i in range(episodes)
-    ]
+    progress, returns = Progress(policy.name, episodes, say), []
+    for i in range(episodes):
+        episode = play(policy, recorder, deterministic, seed + i, progress.step, max_steps)
+        returns.append(progress.played(episode).return_)
+    progress.say_cut(max_steps)
     return _played(recorder, returns, pictures)
 
 
