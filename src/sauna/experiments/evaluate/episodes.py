@@ -151,6 +151,7 @@ def statistics(played: list[Episode]) -> dict[str, Any]:
         "length_mean": float(np.mean(lengths)),
         "length_min": min(lengths),
         "length_max": max(lengths),
+        "cut": sum(e.cut for e in played),
         "returns": returns,
         "lengths": lengths,
     }

@@ -17,6 +17,7 @@ from sauna.config.presets import Member, as_began, members
 from sauna.config.settings import Config
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frames_per_second
@@ -59,8 +60,8 @@ def examine(
     deterministic: bool,
     seed: int,
     pictures: bool,
-    max_steps: int,
     say: Callable[[str], None],
+    max_steps: int = MAX_STEPS,
 ) -> Inspection:
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest

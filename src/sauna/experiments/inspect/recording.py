@@ -83,7 +83,11 @@ class Recorder:
     """
 
     def __init__(
-        self, env: Any, policy: TrainedPolicy, pictures: Pictures | None, max_steps: int
+        self,
+        env: Any,
+        policy: TrainedPolicy,
+        pictures: Pictures | None,
+        max_steps: int = MAX_STEPS,
     ) -> None:
         self._env, self._see, self._pictures = env, policy.see, pictures
         self._max_steps, self._steps = max_steps, 0
