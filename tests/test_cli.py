@@ -49,7 +49,7 @@ BAD = [
     (["train", "worlds:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
     (["train", "worlds:Picture", "--hidden", "8"], "hidden: not read"),
     (["train", WORLD, "--seeds", "123456"], "write 123456,"),
-    (["train", WORLD, "--filter", "worlds:Scripted"], "is not a sauna.Filter"),
+    (["train", WORLD, "--filter", "worlds:Scripted"], "is not a sauna.StepFilter"),
     (["train", WORLD, "--vex-target", "worlds:Scripted"], "is not a sauna.VexTarget"),
     (["train", WORLD, "--network", "worlds:Scripted"], "is not a flax.linen module"),
     (["train", "worlds:ConstantReward", "--log-std-init", "1"], "log_std_init: not read"),

@@ -10,14 +10,14 @@ from sauna.system.errors import BadInput
 
 
 def read_value(name: str, value: Any, field_type: Any) -> Any:
-    """`value` as `field_type`; the fields `env_kwargs` and `seeds` have forms of their own.
+    """`value` as `field_type`; the fields `..._kwargs` and `seeds` have forms of their own.
 
     Raises:
       ValueError, TypeError, KeyError: it cannot be read as that.
       BadInput: a number of seeds that is meant as a seed.
     """
-    if name == "env_kwargs":
-        return _json_object(value)
+    if name.endswith("_kwargs"):
+        return _json_object(name, value)
     if name == "seeds":
         return _seeds(value)
     if field_type is bool:
@@ -67,7 +67,7 @@ def _seeds(value: Any) -> tuple[int, ...]:
     return tuple(_integer(seed) for seed in value)
 
 
-def _json_object(value: Any) -> str:
+def _json_object(name: str, value: Any) -> str:
     parsed = json.loads(value) if isinstance(value, str) else dict(value)
     if not isinstance(parsed, dict):
         raise ValueError
@@ -75,7 +75,7 @@ def _json_object(value: Any) -> str:
         return json.dumps(parsed, sort_keys=True, allow_nan=False, default=_json_value)
     except ValueError:  # which no reader of JSON would take back
         raise BadInput(
-            "env_kwargs: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
+            f"{name}: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
         ) from None
 
 

@@ -15,7 +15,8 @@ from sauna.system.errors import BadInput, nearest, one_line
 
 LOCAL = local.__name__
 STORED_BEFORE = "sauna.local"  # its name in the runs of 0.1.0
-PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
+# What a user may pass by value.
+PARTS = ("env", "network", "vex_target", "filter", "sampler", "loss_weight", "stop")
 _UNIQUE = re.compile(r"_[0-9a-f]{16}$")  # ends a part's name; older runs have names that may meet
 
 

@@ -113,6 +113,31 @@ ARMS: dict[str, dict[str, Any]] = {
     },
 }
 
+# A rule that ranks by |A| or by its sign leaves advantages whose mean is not 0: they are
+# standardised over the rollout before the choice, so that the rule turns no sign round.
+_PPO = {"filter": "none", "vex_coef": 0.0}
+_OVER_ROLLOUT = {**_PPO, "normalize_over": "rollout"}
+ARMS |= {
+    "gigaflow": {**_OVER_ROLLOUT, "sampler": "gigaflow"},
+    "top-advantage": {**_OVER_ROLLOUT, "sampler": "top-advantage"},
+    "prioritized": {**_OVER_ROLLOUT, "sampler": "prioritized"},
+    "gradient-norm": {**_OVER_ROLLOUT, "sampler": "gradient-norm"},
+    "delight": {**_OVER_ROLLOUT, "loss_weight": "delight"},
+    "kondo": {**_OVER_ROLLOUT, "sampler": "kondo", "selection_losses": "policy"},
+    "sample-dropout": {**_PPO, "loss_weight": "sample-dropout"},
+    "espo": {**_PPO, "objective": "unclipped", "stop": "espo"},
+    "target-kl": {**_PPO, "stop": "target-kl"},
+    "spo": {**_PPO, "objective": "spo"},
+    "positive": {**_PPO, "advantage_sign": "positive"},
+    "recompute": {**_PPO, "recompute_advantages": True},
+    "avec": {**_PPO, "critic": "avec", "clip_value": False},
+    "merl": {"filter": "none", "vex_target": "sample", "auxiliary": "next-observation"},
+    "pods": {**_OVER_ROLLOUT, "sampler": "pods"},
+    "vex-oracle": {**_OVER_ROLLOUT, "sampler": "vex-oracle"},
+}
+# Controls follow the rule that they are joined to: `gigaflow+random`.
+CONTROLS = ("random", "stride", "low-advantage", "reversed")
+
 ARM_HELP = {
     "ppo": "PPO (or A2C) alone: no Vex loss, nothing dropped",
     "vex-head": "the Vex head is trained, nothing is dropped",
@@ -120,6 +145,28 @@ ARM_HELP = {
     "sauna": "the corrected method: every state has its own Vex target",
     "sauna-paper": "the method as the paper states it",
     "sauna-reference": "the method as the authors' released code does it, quirks included",
+    "gigaflow": "rollout: drop samples far below the running largest |advantage|",
+    "top-advantage": "rollout: keep the half of largest |advantage|",
+    "prioritized": "rollout: draw minibatches by |advantage|, weighted back",
+    "gradient-norm": "rollout: draw minibatches by the norm of the gradient at the policy head",
+    "delight": "loss: weigh a sample by advantage times surprisal",
+    "kondo": "rollout: the policy learns from the 30% of largest advantage times surprisal",
+    "sample-dropout": "loss: leave out policy terms whose ratio has gone far from 1",
+    "espo": "stop: no clip; stop once the mean |ratio - 1| is 0.25",
+    "target-kl": "stop: stop once the KL divergence is 1.5 times 0.02",
+    "spo": "loss: a penalty on the ratio in place of the clip",
+    "positive": "loss: learn from max(0, advantage) alone",
+    "recompute": "epoch: advantages anew before each epoch",
+    "avec": "critic: fit the variance of the error instead of its square",
+    "merl": "critic: heads for the explained variance and the next observation are trained along",
+    "pods": "rollout: the half of the 64-step segments whose advantages vary most",
+    "vex-oracle": "rollout: keep where SAUNA's quantity, known afterwards, is high",
+}
+CONTROL_HELP = {
+    "random": "as many samples as the rule takes in each iteration, at random",
+    "stride": "as many, every k-th",
+    "low-advantage": "as many, those of smallest |advantage|",
+    "reversed": "as many, those that the rule wants least",
 }
 
 # The arms of a comparison where none are named; the first is the baseline.
@@ -127,6 +174,38 @@ COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
 
 # Settings that a study or a comparison decides itself.
 DECIDED = ("env", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
+
+
+def arm_settings(arm: str) -> dict[str, Any]:
+    """The settings of an arm, or of several rules joined by `+`: `sauna+avec`, `gigaflow+random`.
+
+    A part of a joined arm adds what it changes of `ppo`; the last part may be a control.
+
+    Raises:
+      BadInput: an unknown name (naming the nearest), or two parts that want different things.
+    """
+    first, *others = arm.split("+")
+    settings = dict(_part(first))
+    changed = {name for name, value in settings.items() if ARMS["ppo"].get(name) != value}
+    for part in others:
+        added = {"control": part} if part in CONTROLS else _part(part)
+        for name, value in added.items():
+            if ARMS["ppo"].get(name) == value:
+                continue
+            if name in changed and settings[name] != value:
+                raise BadInput(f"arm: {arm} joins {name} {settings[name]} and {name} {value}")
+            settings[name] = value
+            changed.add(name)
+    return settings
+
+
+def _part(name: str) -> Mapping[str, Any]:
+    if name in CONTROLS:
+        raise BadInput(f"arm: {name} follows a rule; join it to one, such as gigaflow+{name}")
+    if name not in ARMS:
+        raise BadInput(f"unknown arm {name!r} (known: {', '.join(ARMS)}){nearest(name, ARMS)}")
+    return ARMS[name]
+
 
 # What makes an arm what its name says; the user's own values do not apply to these.
 FIXED: dict[str, tuple[str, ...]] = {
@@ -225,8 +304,7 @@ def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
     if not arms or len(set(arms)) != len(arms):
         raise BadInput("arm: give each arm once, and at least one")
     for arm in arms:
-        if arm not in ARMS:
-            raise BadInput(f"unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
+        arm_settings(arm)
     chosen_preset(parsed)
     for name in parsed:
         if all(name in FIXED.get(arm, ()) for arm in arms):
@@ -260,7 +338,7 @@ def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
     preset = chosen_preset(parsed)
     own = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
     of_env = {"rescale_actions": False} if PUBLISHED.match(parsed.get("env", "")) else {}
-    settings = {**of_env, **PRESETS[preset], **ARMS[arm], **own, "preset": preset}
+    settings = {**of_env, **PRESETS[preset], **arm_settings(arm), **own, "preset": preset}
     return dataclasses.replace(Config(), **settings)
 
 

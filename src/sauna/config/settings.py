@@ -22,6 +22,17 @@ from sauna.system.errors import BadInput, nearest
 NATIVE = ("gymnax", "playground", "brax", "mjx")  # `NAME/...`: environments of the device alone
 ON_DEVICE = ("reset", "device", "devices", "distributed")  # fields that only the device reads
 FILTERS = ("none", "sauna", "random-drop")
+SAMPLERS = (
+    "none",
+    "gigaflow",
+    "top-advantage",
+    "prioritized",
+    "gradient-norm",
+    "kondo",
+    "positive",
+    "pods",
+    "vex-oracle",
+)
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
 NETWORKS = ("auto", "mlp", "nature-cnn")
 
@@ -193,6 +204,74 @@ class Config:
     filter: str = option(
         "sauna", "which transitions the update keeps", choices=FILTERS, plugin=True
     )
+    sampler: str = option(
+        "none",
+        "which of the rollout's samples the update learns from, once advantages are known",
+        choices=SAMPLERS,
+        plugin=True,
+    )
+    sampler_kwargs: str = option("{}", "arguments of the sampler, as a JSON object")
+    control: str = option(
+        "none",
+        "instead of what the rule takes, as many samples in each iteration: at random, every "
+        "k-th, those of smallest |advantage|, or those that the rule wants least",
+        choices=("none", "random", "stride", "low-advantage", "reversed"),
+    )
+    selection_mode: str = option(
+        "fewer",
+        "fewer gradient steps on minibatches of the same size, as many steps on smaller ones, or "
+        "as many of the same size, refilled with what was taken",
+        choices=("fewer", "smaller", "refill"),
+    )
+    selection_losses: str = option(
+        "all",
+        "the sampler chooses for all losses, or for the policy loss alone",
+        choices=("all", "policy"),
+    )
+    normalize_over: str = option(
+        "minibatch",
+        "what advantages are standardised over",
+        choices=("minibatch", "rollout", "kept"),
+    )
+    advantage_sign: str = option(
+        "both",
+        "learn from all advantages, or from max(0, A) / std(A)",
+        choices=("both", "positive"),
+    )
+    objective: str = option(
+        "clip",
+        "the policy term: PPO's clip, SPO's penalty, or neither",
+        choices=("clip", "spo", "unclipped"),
+    )
+    loss_weight: str = option(
+        "none",
+        "what weighs each policy term of a minibatch",
+        choices=("none", "delight", "sample-dropout"),
+        plugin=True,
+    )
+    loss_weight_kwargs: str = option("{}", "arguments of the loss weight, as a JSON object")
+    stop: str = option(
+        "none",
+        "what ends an iteration's updates early",
+        choices=("none", "target-kl", "espo"),
+        plugin=True,
+    )
+    stop_kwargs: str = option("{}", "arguments of the stop rule, as a JSON object")
+    critic: str = option(
+        "squared",
+        "the value loss: squared errors, or their variance (AVEC)",
+        choices=("squared", "avec"),
+    )
+    recompute_advantages: bool = option(
+        False, "compute values and advantages anew before each epoch"
+    )
+    auxiliary: str = option(
+        "none",
+        "a head that is trained along to predict the next observation, or, as MERL's released "
+        "code does, that of another row",
+        choices=("none", "next-observation", "shuffled-observation"),
+    )
+    auxiliary_coef: float = option(0.01, "weight of the auxiliary loss", at_least=0)
     threshold: float = option(
         0.3, "keep where |Vex| / |median| reaches this (eq. 7)", at_least=0, shapes_program=False
     )
@@ -319,6 +398,19 @@ _READERS: dict[str, tuple[str, Any]] = {
     ),
     "drop_rate": ("filter random-drop", lambda c: c.filter == "random-drop"),
     "drop_rate_from": ("filter random-drop", lambda c: c.filter == "random-drop"),
+    "sampler_kwargs": ("a sampler", lambda c: c.sampler != "none"),
+    "selection_mode": (
+        "a sampler, or a filter with dropped=mask",
+        lambda c: c.sampler != "none" or (c.filter != "none" and c.dropped == "mask"),
+    ),
+    "selection_losses": ("a sampler", lambda c: c.sampler != "none"),
+    "normalize_over": ("normalize_advantages", lambda c: c.normalize_advantages),
+    "loss_weight_kwargs": ("a loss_weight", lambda c: c.loss_weight != "none"),
+    "stop": ("algorithm ppo", lambda c: c.algorithm == "ppo"),
+    "objective": ("algorithm ppo", lambda c: c.algorithm == "ppo"),
+    "recompute_advantages": ("algorithm ppo", lambda c: c.algorithm == "ppo"),
+    "stop_kwargs": ("a stop rule", lambda c: c.stop != "none"),
+    "auxiliary_coef": ("an auxiliary head", lambda c: c.auxiliary != "none"),
     "vex_target": ("vex_coef above 0", lambda c: c.vex_coef > 0),
     "hidden": ("the mlp network", lambda c: c.network in ("auto", "mlp")),
     "activation": ("the mlp network", lambda c: c.network in ("auto", "mlp")),
@@ -381,10 +473,46 @@ def check_consistent(config: Config) -> None:
         )
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
-    for name in ("network", "vex_target", "filter"):
+    check_rules(config)
+    for name in ("network", "vex_target", "filter", "sampler", "loss_weight", "stop"):
         value = getattr(config, name)
         if ":" in value:
             import_name(name, value)
+
+
+def check_rules(config: Config) -> None:
+    """Refuses rules of selection that cannot work together.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    stages = [
+        name for name in ("filter", "sampler", "loss_weight") if getattr(config, name) != "none"
+    ]
+    if config.control != "none":
+        if not stages:
+            raise BadInput("control: needs a rule to follow: a filter, a sampler or a loss_weight")
+        if len(stages) > 1:
+            raise BadInput(f"control: {' and '.join(stages)} are two rules; it can follow one")
+        if stages == ["loss_weight"] and config.control not in ("random", "reversed"):
+            raise BadInput(
+                f"control: a loss_weight is controlled by random or reversed, not by "
+                f"{config.control}"
+            )
+        if config.filter == "random-drop":
+            raise BadInput("control: random-drop is a control itself")
+    if config.gae_over == "kept":
+        unfit = [("control", "none"), ("critic", "squared"), ("recompute_advantages", False)]
+        for name, plain in unfit:
+            if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
+                raise BadInput(f"{name}: needs gae_over=all")
+    if config.algorithm == "a2c" and config.stop != "none":
+        raise BadInput("stop: A2C makes one pass, which nothing stops early")
+    if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
+        raise BadInput(
+            "objective: unclipped needs a stop rule (espo) or a loss_weight "
+            "(sample-dropout): nothing else bounds the ratio"
+        )
 
 
 def local_parts(config: Config) -> list[str]:
@@ -395,7 +523,7 @@ def local_parts(config: Config) -> list[str]:
 def to_json(config: Config) -> dict[str, Any]:
     """The config as JSON values, in field order."""
     values = dataclasses.asdict(config)
-    values["env_kwargs"] = json.loads(config.env_kwargs)
+    values |= {name: json.loads(values[name]) for name in values if name.endswith("_kwargs")}
     return {
         name: list(value) if isinstance(value, tuple) else value for name, value in values.items()
     }

@@ -12,7 +12,7 @@ from sauna.algorithm.learner.vex_targets import make_target
 from sauna.algorithm.policy.policy import check_collections, make_trunk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import make_program
-from sauna.algorithm.types import Filter, Hypers
+from sauna.algorithm.types import Hypers, ScoredStep, StepFilter
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput, one_line
@@ -115,7 +115,7 @@ def _check_target(config: Config) -> None:
         )
 
 
-def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
+def _check_filter(config: Config, spaces: Spaces, filter: StepFilter) -> None:
     number: Any = jax.ShapeDtypeStruct((), jnp.float32)
     kind = jnp.uint8 if spaces.observation_kind == "image" else jnp.float32
     seen = jax.ShapeDtypeStruct((config.envs, *spaces.observation_shape), kind)
@@ -125,7 +125,10 @@ def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
     key = jax.eval_shape(lambda: jax.random.key(0))
     hypers = Hypers(*[number] * len(Hypers._fields))
     before = jax.eval_shape(lambda x: x, state)
-    after, mask = jax.eval_shape(filter.keep, before, seen, vex, key, hypers)
+    width = jnp.float32 if spaces.action_kind == "continuous" else jnp.int32
+    action = jax.ShapeDtypeStruct((config.envs, spaces.action_width), width)
+    scored = ScoredStep(seen, action, vex, vex, vex)
+    after, mask = jax.eval_shape(filter.keep, before, scored, key, hypers)
     if getattr(mask, "shape", None) != (config.envs,) or mask.dtype != bool:
         raise BadInput(
             f"filter: {config.filter} gives a mask of shape {_shape(mask)} and type "

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import ARMS, Member, parse_all, resolve
+from sauna.config.presets import Member, arm_settings, parse_all, resolve
 from sauna.config.settings import ON_DEVICE, Config, check_read, local_parts
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
@@ -202,7 +202,7 @@ def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
     if not source:
         return []
     arms = run_directory.read_config(Path(source))["config"]["arm"]
-    filtered = [arm for arm in arms if ARMS[arm]["filter"] != "none"]
+    filtered = [arm for arm in arms if arm_settings(arm)["filter"] != "none"]
     if len(filtered) != 1:
         raise BadInput(f"drop_rate_from: {source} has {len(filtered)} filtered arms; it needs one")
     if not run_directory.is_complete(Path(source)):

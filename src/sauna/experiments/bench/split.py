@@ -21,7 +21,7 @@ from sauna.algorithm.learner.program import Learner, make_learner
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
-from sauna.algorithm.types import TrainState, member_keys
+from sauna.algorithm.types import TrainState, member_keys, selection_key
 from sauna.config.presets import members, resolve
 from sauna.envs.host import mujoco_tasks
 from sauna.envs.host.atari_envs import AtariEnvs
@@ -101,7 +101,7 @@ def split(settings: dict[str, Any], count: int) -> dict[str, float]:
     timers = Timers()
     cost = timers.calibrate()
     program = make_program(config, found.spaces)
-    learner = _timed(make_learner(config, program.policy), LEARNING, timers)
+    learner = _timed(make_learner(config, program.policy, found.spaces), LEARNING, timers)
     acting = {k: v for k, v in ACTING.items() if k != "decide" or program.filter is not None}
     program = _timed(program, acting, timers)
     envs = host.make_envs(job)
@@ -180,7 +180,14 @@ def _train(
         collected = collector.collect(params, hypers, iteration, limit)
         for p, member in enumerate(job.members):
             order = minibatch_order(job.config, member.seed, iteration)
-            states[p], learned = host._learn(learner, states[p], collected[p], hypers[p], order)
+            states[p], learned = host._learn(
+                learner,
+                states[p],
+                collected[p],
+                hypers[p],
+                order,
+                selection_key(keys[p], iteration),
+            )
             counters[p].add(collected[p])
             steps += collected[p].env_steps
             log(member, job.config, iteration, collected[p], counters[p], learned, hypers[p])

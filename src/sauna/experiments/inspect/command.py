@@ -52,6 +52,6 @@ def inspect(
     from sauna.experiments.inspect.inspection import examine  # imports JAX, so after the checks
     from sauna.experiments.inspect.page import make_page
 
-    found = examine(run, artifact, name, episodes, deterministic, seed, pictures, max_steps, say)
+    found = examine(run, artifact, name, episodes, deterministic, seed, pictures, say, max_steps)
     path.write_text(make_page(found, run), encoding="utf-8")
     return path

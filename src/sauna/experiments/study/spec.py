@@ -31,7 +31,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna.config.presets import ARMS, DECIDED, FIXED, SHARED_RULES, arm_config, parse_all, resolve
+from sauna.config.presets import (
+    DECIDED,
+    FIXED,
+    SHARED_RULES,
+    arm_config,
+    arm_settings,
+    parse_all,
+    resolve,
+)
 from sauna.config.settings import FIELDS, Config, check_read, parse, to_json
 from sauna.system.errors import BadInput, nearest
 
@@ -120,8 +128,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
             known = [*_ARM, *(name for name in FIELDS if name not in _OWN)]
             raise BadInput(f"study: unknown key {key!r} in an arm{nearest(key, known)}")
     arm = _text(entry.get("arm", entry.get("label")), "arm")
-    if arm not in ARMS:
-        raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
+    arm_settings(arm)
     tasks = entry.get("tasks", top.get("tasks"))
     if not isinstance(tasks, list) or not tasks or len(set(map(str, tasks))) < len(tasks):
         raise BadInput("study: tasks must be a list of environments, each of them once")
@@ -210,7 +217,7 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
     known = {other.label: other for other in arms}
     source = arm.rates_of
     if arm.arm == "random-drop" and source is None and "drop_rate" not in arm.settings:
-        filtered = [a.label for a in arms if ARMS[a.arm]["filter"] == "sauna"]
+        filtered = [a.label for a in arms if arm_settings(a.arm)["filter"] == "sauna"]
         if not filtered:
             raise BadInput("study: random-drop needs a filtered arm whose rates it repeats")
         source = filtered[0]
@@ -228,7 +235,7 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
             f"{', '.join(sorted(missing))}"
         )
     if source is not None:
-        if ARMS[known[source].arm]["filter"] != "sauna":
+        if arm_settings(known[source].arm)["filter"] != "sauna":
             raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")
         if set(arm.tasks) - set(known[source].tasks) or arm.seeds != known[source].seeds:
             raise BadInput(f"study: {source!r} must have the tasks and the seeds of {arm.label!r}")

@@ -43,8 +43,10 @@ from sauna.training.loop.member_state import (
     flat_params,
     named_optimizer,
     named_params,
+    named_sampler,
     under,
     unpack_optimizer,
+    unpack_sampler,
 )
 from sauna.training.loop.metrics import metrics_row
 from sauna.training.loop.multihost import check_shared, join, leave, read_place, same, share, tell
@@ -229,7 +231,7 @@ def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
 def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arrays:
     learner = state.learner
     arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
-    arrays |= named_optimizer(learner)
+    arrays |= named_optimizer(learner) | named_sampler(learner)
     arrays |= counters.to_arrays()
     moments = state.collect.observation_moments
     if isinstance(moments, Moments):  # where a trained policy looks for them, and as the host's
@@ -280,7 +282,7 @@ def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray])
         params = flat_params(population.policy, example.learner.params, under("params/", own))
         states.append(
             MemberState(
-                TrainState(params, optimizer),
+                TrainState(params, optimizer, unpack_sampler(own, example.learner)),
                 filled(example.collect, under("collect/", own)),
                 jnp.int32(counted.env_steps),
                 jnp.int32(counted.kept_steps),

@@ -17,15 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.learner.program import make_parts
 from sauna.algorithm.learner.samples import make_batch
-from sauna.algorithm.learner.update import device_minibatch_order, init_state, learn
-from sauna.algorithm.learner.vex_targets import VexTarget, make_target
+from sauna.algorithm.learner.update import Parts, device_minibatch_order, init_state
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.device import Collecting, CollectState, Ends, Faults, collect, start
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.types import Array, Hypers, Rollout, TrainState
+from sauna.algorithm.types import Array, Hypers, Rollout, TrainState, selection_key
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv
 from sauna.envs.spaces import Spaces
@@ -58,33 +59,33 @@ class Report(NamedTuple):
     learning_rate: Array
 
 
-class Parts(NamedTuple):
+class IterationParts(NamedTuple):
     """The static parts of an iteration."""
 
     config: Config
     collecting: Collecting
     policy: Policy
-    target: VexTarget
+    learning: Parts
 
 
-def make_parts(config: Config, spaces: Spaces, env: JaxEnv, anywhere: Any) -> Parts:
+def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, anywhere: Any) -> IterationParts:
     """Args:
     env: flat, of `spaces`.
     anywhere: see `jax_env.advance`.
     """
     policy = make_policy(config, spaces)
     collecting = Collecting(config, env, policy, make_filter(config), anywhere)
-    return Parts(config, collecting, policy, make_target(config))
+    return IterationParts(config, collecting, policy, make_parts(config, policy, spaces))
 
 
-def init_member(parts: Parts, setting: Setting) -> MemberState:
+def init_member(parts: IterationParts, setting: Setting) -> MemberState:
     zero = jnp.int32(0)
-    learner = init_state(parts.config, parts.policy, setting.keys.init)
+    learner = init_state(parts.learning, setting.keys.init)
     return MemberState(learner, start(parts.collecting, setting.keys.env), zero, zero)
 
 
 def iterate(
-    parts: Parts, state: MemberState, setting: Setting, iteration: Array
+    parts: IterationParts, state: MemberState, setting: Setting, iteration: Array
 ) -> tuple[MemberState, Report]:
     """One iteration of one member: collect -> advantages -> update.
 
@@ -119,7 +120,7 @@ def iterate(
 
 
 def learn_from(
-    parts: Parts,
+    parts: IterationParts,
     learner: TrainState,
     rollout: Rollout,
     setting: Setting,
@@ -128,18 +129,10 @@ def learn_from(
 ) -> tuple[TrainState, UpdateMetrics]:
     """Advantages and the update."""
     config = parts.config
-    batch = make_batch(rollout, hypers, config=config, target=parts.target)
+    key = selection_key(setting.keys, iteration)
+    batch = make_batch(rollout, hypers, key, config=config, target=parts.learning.target)
     order = device_minibatch_order(config, jax.random.fold_in(setting.keys.order, iteration))
-    return learn(
-        learner,
-        rollout,
-        batch,
-        hypers,
-        order,
-        config=config,
-        policy=parts.policy,
-        target=parts.target,
-    )
+    return learn(learner, rollout, batch, hypers, order, key, parts=parts.learning)
 
 
 def several(
@@ -210,7 +203,7 @@ class Population:
             """Over the members of one program: stays a scalar, so that a branch stays a branch."""
             return jax.lax.pmax(here.astype(jnp.int32), MEMBERS) > 0 if together else here
 
-        self.parts = parts = make_parts(config, spaces, env, anywhere)
+        self.parts = parts = make_iteration(config, spaces, env, anywhere)
         self.policy = parts.policy
         init = self.over_members(partial(init_member, parts))
         self._settings: Any = stack(settings) if together else settings

@@ -8,6 +8,7 @@ This is the loop itself. Who starts it, what is shown of it and where its messag
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +19,7 @@ from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.collected import Collected
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
-from sauna.algorithm.types import Hypers, Keys, TrainState, member_keys
+from sauna.algorithm.types import Hypers, Keys, TrainState, member_keys, selection_key
 from sauna.config.presets import Member
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
@@ -39,8 +40,9 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
     config, members = job.config, job.members
     reporter.phase("making environments")
     program = make_program(config, job.spaces)
-    learner = make_learner(config, program.policy)
+    learner = make_learner(config, program.policy, job.spaces)
     keys = [member_keys(member.seed) for member in members]
+    draw_key = jax.jit(selection_key)
     envs = make_envs(job)
     try:
         collector = HostCollector(program, job.spaces, envs, keys)
@@ -57,7 +59,9 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
             rows = []
             for p in np.flatnonzero(limit):
                 order = minibatch_order(config, members[p].seed, iteration)
-                states[p], learned = _learn(learner, states[p], collected[p], hypers[p], order)
+                states[p], learned = _learn(
+                    learner, states[p], collected[p], hypers[p], order, draw_key(keys[p], iteration)
+                )
                 check_finite(members[p], iteration, learned)
                 counters[p].add(collected[p])
                 rows.append(
@@ -125,10 +129,11 @@ def _learn(
     collected: Collected,
     hypers: Hypers,
     order: np.ndarray,
+    key: Any,
 ) -> tuple[TrainState, UpdateMetrics]:
     assert collected.rollout is not None
-    batch = learner.make_batch(collected.rollout, hypers)
-    state, metrics = learner.learn(state, collected.rollout, batch, hypers, order)
+    batch = learner.make_batch(collected.rollout, hypers, key)
+    state, metrics = learner.learn(state, collected.rollout, batch, hypers, order, key)
     return state, jax.device_get(metrics)
 
 
