@@ -1,13 +1,14 @@
 # make setup  install into .venv what development needs
 # make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
 # make test   install into .venv, run the tests
-# make test-faults  a few tries of every fault of docs/reliability.md
+# make test-faults  a few tries of every fault of docs/concepts/reliability.md
 # make test-newest  both with the newest versions of all packages, in .venv-newest
 # make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
-# make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
+# make campaign  every fault of docs/concepts/reliability.md in full (hours; continues where it stopped)
 # make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
 # make cost   what checks and checkpoints take of a training
+# make docs   build the documentation site into site/; a broken link is an error
 # make lint   style, format and types
 # make constraints  resolve all packages anew and write constraints.txt, which all of the above install from
 # make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
@@ -20,7 +21,7 @@ BIN := $(VENV)/bin
 INSTALL = $(BIN)/pip --disable-pip-version-check install $(VERSIONS) -e
 USE = @echo "To use sauna in this shell: source $(VENV)/bin/activate"
 
-.PHONY: setup setup-ci demo test test-faults test-newest test-slow campaign mutants soak cost lint constraints results clean
+.PHONY: setup setup-ci demo test test-faults test-newest test-slow campaign mutants soak cost docs lint constraints results clean
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
@@ -39,8 +40,12 @@ $(VENV)/.ci: $(BIN)/python pyproject.toml constraints.txt
 	@touch $@ $(VENV)/.dev $(VENV)/.run
 
 $(VENV)/.slow: $(BIN)/python pyproject.toml constraints.txt
-	$(INSTALL) '.[dev,cluster,brax,playground]'
-	@touch $@ $(VENV)/.ci $(VENV)/.dev $(VENV)/.run
+	$(INSTALL) '.[dev,docs,cluster,brax,playground]'
+	@touch $@ $(VENV)/.ci $(VENV)/.dev $(VENV)/.docs $(VENV)/.run
+
+$(VENV)/.docs: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) '.[docs]'
+	@touch $@ $(VENV)/.run
 
 setup: $(VENV)/.dev
 	$(USE)
@@ -78,6 +83,9 @@ soak: $(VENV)/.dev
 
 cost: $(VENV)/.dev
 	$(BIN)/python tests/faults/cost.py
+
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""The Python face: `sauna.train`, `sauna.resume`, `sauna.load`."""
+"""The Python interface: `sauna.train`, `sauna.resume`, `sauna.load`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config.plugins import PARTS, is_local, name_of, provide
+from sauna.config.accepted import translate
+from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
+from sauna.config.settings import fields_with
 from sauna.envs.make import check_makes, known_in_this_process_alone
 from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
@@ -17,9 +19,11 @@ from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
 
+PARTS = fields_with("plugin")  # what a user may pass by value
+
 
 def _env_name(env: Any) -> str:
-    """The name of an environment; an id that this program registered is a part of this process.
+    """Names an environment; an id that this program registered is a part of this process.
 
     Raises:
       BadInput: it is an environment itself, or makes none.
@@ -71,19 +75,18 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
       env: a Gymnasium id, `module:function`, or a function that makes an environment.
       quiet: show nothing.
       **settings: any field of `sauna.config.settings.Config` (`arm="sauna"`, `seeds=6`,
-        `steps=1_000_000`); functions, flax modules, filters and targets may be passed by value.
+        `steps=1_000_000`), `seed=7` for the one seed 7, `batch_size` for samples per minibatch;
+        functions, flax modules, filters and targets may be passed by value.
 
     Raises:
       BadInput: a setting is not usable; nothing was created.
       SaunaError: training failed; the last good checkpoint is on disk.
     """
-    given = {"env": _env_name(env)}
-    for name, value in settings.items():
-        given[name] = name_of(value) if name in PARTS and value is not None else value
-    if settings.get("out") is not None:
-        given["out"] = str(settings["out"])
+    overrides = translate({"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}})
+    if overrides.get("out") is not None:
+        overrides["out"] = str(overrides["out"])
     display: Display = _Silent() if quiet else make_display()
-    run = runs.start(given, display)
+    run = runs.start(overrides, display)
     train_and_draw(run, display, resume=False)
     return Result(run.path)
 
@@ -132,18 +135,14 @@ def compare(
     """
     from sauna.experiments.study.command import compare_command, comparison, study
 
-    given = {"env": _env_name(env), **settings}
+    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
     for name in PARTS:
-        if name in given:
-            given[name] = name_of(given[name])
-            if is_local(given[name]):
-                raise BadInput(
-                    f"{name}: other processes cannot import it; put it into a module, and give "
-                    "module:name (or module:Id-v0, if importing it registers the id)"
-                )
-    task = given.pop("env")
-    spec = comparison(task, tuple(arms), parse_all(given))
-    command = compare_command(task, tuple(arms), given, out)
+        if is_local(str(overrides.get(name))):
+            raise BadInput(f"{name}: other processes cannot import it; put it into a module")
+    task = overrides.pop("env")
+    overrides = translate(overrides)
+    spec = comparison(task, tuple(arms), parse_all(overrides))
+    command = compare_command(task, tuple(arms), overrides, out)
     return study(spec, Path(out), command, processes, quiet=quiet)
 
 
@@ -160,7 +159,7 @@ def resume(
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    rest = provide(Path(path), changes)
+    rest = provide(Path(path), changes, PARTS)
     run = runs.reopen(Path(path), rest, display)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
@@ -179,8 +178,13 @@ def load(
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       **parts: those that were passed by value when the run started (`env`, `network`, ...).
     """
-    provide(Path(path), parts)
+    provide(Path(path), parts, PARTS)
     from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
     return TrainedPolicy(load_artifact(Path(path), iteration=checkpoint), member)
+
+
+def _named(name: str, value: Any) -> Any:
+    """Names a part that was passed by value; other values stay."""
+    return name_of(value) if name in PARTS and value is not None else value

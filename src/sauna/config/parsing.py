@@ -10,7 +10,7 @@ from sauna.system.errors import BadInput
 
 
 def read_value(name: str, value: Any, field_type: Any) -> Any:
-    """`value` as `field_type`; the fields `..._kwargs` and `seeds` have forms of their own.
+    """Reads `value` as `field_type`; the fields `..._kwargs` and `seeds` have forms of their own.
 
     Raises:
       ValueError, TypeError, KeyError: it cannot be read as that.
@@ -41,7 +41,7 @@ _BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, 
 
 
 def _integer(value: Any) -> int:
-    """Whole numbers, also as `1e6`; a bool or 1.5 is not one."""
+    """Reads a whole number, also as `1e6`; a bool or 1.5 is not one."""
     if isinstance(value, bool):
         raise TypeError
     if isinstance(value, int):
@@ -52,19 +52,34 @@ def _integer(value: Any) -> int:
     return int(number)
 
 
-MOST_SEEDS = 10_000
+MAX_SEEDS = 10_000
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
-    """A count (`6`, `"6"`) means seeds 0 to 5; a sequence or `"100,101"` names the seeds."""
+    """Reads a count (`6`, `"6"`: seeds 0 to 5) or the seeds themselves (a list, `"100,101"`)."""
     if isinstance(value, str) and "," in value:
         value = [part for part in value.split(",") if part.strip()]
     if isinstance(value, str | int | float):
         number = _integer(value)
-        if number > MOST_SEEDS:
-            raise BadInput(f"seeds: {number} is too many; for the seed {number} write {number},")
+        if number > MAX_SEEDS:
+            raise BadInput(
+                f"seeds: {number} is too many; for the one seed {number} write --seed {number}"
+            )
         return tuple(range(number))
     return tuple(_integer(seed) for seed in value)
+
+
+MANY_SEEDS = 20  # from which a count may have been meant as a seed
+
+
+def many_seeds(seeds: tuple[int, ...]) -> str | None:
+    """Says what a large count of seeds means, for it may have been meant as a seed."""
+    number = len(seeds)
+    if number < MANY_SEEDS or seeds != tuple(range(number)):
+        return None
+    return (
+        f"note: {number} seeds, 0 to {number - 1}; for the one seed {number} write --seed {number}"
+    )
 
 
 def _json_object(name: str, value: Any) -> str:

@@ -6,7 +6,7 @@ import importlib
 import re
 import sys
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,6 @@ from sauna.system.errors import BadInput, nearest, one_line
 
 LOCAL = local.__name__
 STORED_BEFORE = "sauna.local"  # its name in the runs of 0.1.0
-# What a user may pass by value.
-PARTS = ("env", "network", "vex_target", "filter", "sampler", "loss_weight", "stop")
 _UNIQUE = re.compile(r"_[0-9a-f]{16}$")  # ends a part's name; older runs have names that may meet
 
 
@@ -95,8 +93,11 @@ def is_held(path: str) -> bool:
     return hasattr(local, path.partition(":")[2])
 
 
-def provide(run: Path, given: Mapping[str, Any]) -> dict[str, Any]:
+def provide(run: Path, given: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
     """Puts parts passed by value where a run's config looks for them; returns the rest.
+
+    Args:
+      parts: the fields that may be passed by value.
 
     Raises:
       BadInput: a part is given that the run finds by name, or one is missing.
@@ -104,7 +105,7 @@ def provide(run: Path, given: Mapping[str, Any]) -> dict[str, Any]:
     from sauna.system import run_directory  # which Windows cannot import
 
     config = run_directory.read_config(run).get("config", {})
-    for name in PARTS:
+    for name in parts:
         path = str(config.get(name))
         if is_local(path):
             if name in given:
@@ -113,7 +114,7 @@ def provide(run: Path, given: Mapping[str, Any]) -> dict[str, Any]:
                 raise BadInput(f"{name}: was passed by value; pass it again as {name}=...")
         elif name in given:
             raise BadInput(f"{name}: the run finds its own by name ({config.get(name)})")
-    return {name: value for name, value in given.items() if name not in PARTS}
+    return {name: value for name, value in given.items() if name not in parts}
 
 
 def is_local(path: str) -> bool:

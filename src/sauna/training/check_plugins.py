@@ -108,10 +108,10 @@ def _check_target(config: Config) -> None:
         else (config.rollout_steps, config.envs)
     )
     x, episode = jax.ShapeDtypeStruct(shape, jnp.float32), jax.ShapeDtypeStruct(shape, jnp.int32)
-    told = jax.eval_shape(target.target, x, x, x, episode)
-    if getattr(told, "shape", None) != shape:
+    found = jax.eval_shape(target.target, x, x, x, episode)
+    if getattr(found, "shape", None) != shape:
         raise BadInput(
-            f"vex_target: {config.vex_target} gives shape {_shape(told)} instead of {shape}"
+            f"vex_target: {config.vex_target} gives shape {_shape(found)} instead of {shape}"
         )
 
 
@@ -149,5 +149,5 @@ def _shape(x: Any) -> Any:
 
 
 def _may_become(before: Any, after: Any) -> bool:
-    """Whether a loop may carry both; a Python number takes the type that it is used with."""
+    """Returns whether a loop may carry both; a Python number takes the type of its use."""
     return before.shape == after.shape and (before.dtype == after.dtype or before.weak_type)

@@ -26,8 +26,9 @@ from sauna.algorithm.learner.update import init_state, update_on_all
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy, score
 from sauna.algorithm.types import Batch
-from sauna.config.presets import PRESET_HELP, PRESETS, resolve, stored_config
+from sauna.config.presets import PRESET_HELP, PRESETS, resolve
 from sauna.config.settings import FIELDS
+from sauna.config.stored import stored_config
 from sauna.envs.spaces import Spaces
 from sauna.experiments.study.command import comparison
 from sauna.experiments.study.spec import check, load_spec

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sauna.config.plugins import is_local, name_of, provide
-from sauna.config.settings import parse
+from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
@@ -124,7 +124,7 @@ def _provided(run: Path, env: Any, parts: Mapping[str, Any]) -> str | None:
             parts, env = {**parts, "env": env}, None
         else:
             env = name_of(env)
-    rest = provide(run, parts)
+    rest = provide(run, parts, fields_with("plugin"))
     if rest:
         raise BadInput(f"unknown argument {next(iter(rest))!r}")
     return env
@@ -155,3 +155,19 @@ def statistics(played: list[Episode]) -> dict[str, Any]:
         "returns": returns,
         "lengths": lengths,
     }
+
+
+def report(result: dict[str, Any]) -> list[str]:
+    """Says an evaluation in lines."""
+    lines = [
+        f"{result['env']}, {result['mode']} actions, frozen normaliser, "
+        f"checkpoint of iteration {result['iteration']}"
+    ]
+    for name, row in result["members"].items():
+        lines.append(
+            f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
+            f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
+            f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
+            f"{row['episodes']} episodes"
+        )
+    return lines

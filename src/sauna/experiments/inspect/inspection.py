@@ -13,7 +13,7 @@ import numpy as np
 
 from sauna.algorithm.policy.normalize import Moments, scale_rewards
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, member_keys
-from sauna.config.presets import Member, as_began, members
+from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
@@ -65,7 +65,7 @@ def examine(
 ) -> Inspection:
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
-    everyone = members(artifact.config, as_began(manifest["config"], manifest["given"]))
+    everyone = artifact.run.members
     member = next(one for one in everyone if one.name == name)
     config, iteration = member.config, int(manifest["iteration"])
     kwargs = json.loads(config.env_kwargs)

@@ -22,7 +22,6 @@ own `tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured dr
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import string
 import tomllib
@@ -31,19 +30,19 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sauna.config.checks import is_read
 from sauna.config.presets import (
-    DECIDED,
     FIXED,
-    SHARED_RULES,
+    RunConfig,
     arm_config,
     arm_settings,
     parse_all,
-    resolve,
+    resolve_run,
 )
-from sauna.config.settings import FIELDS, Config, check_read, parse, to_json
+from sauna.config.settings import FIELDS, Config, fields_with, parse, to_json
 from sauna.system.errors import BadInput, nearest
 
-_OWN = (*DECIDED, "seeds")
+_OWN = (*fields_with("decided_by_study"), "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
 MEASURES = ("noise", "dial", "torso")
@@ -61,9 +60,14 @@ class Arm(NamedTuple):
     baseline: str | None  # the label it is compared with
     rates_of: str | None  # the label whose drop rates it repeats
 
-    def given(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
-        """The settings of a run of some seeds on one task."""
+    def overrides(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
+        """Gives the settings of a run of some seeds on one task."""
         return {**self.settings, "env": task, "arm": self.arm, "seeds": list(seeds)}
+
+    def checked_overrides(self, task: str) -> dict[str, Any]:
+        """Gives the settings of all seeds, with a stand-in for a source that is not there yet."""
+        source = {"drop_rate_from": "the source"} if self.rates_of is not None else {}
+        return {**self.overrides(task, self.seeds), **source}
 
 
 class Spec(NamedTuple):
@@ -151,12 +155,8 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
 
 def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
     """Whether a run of `arm` with these settings takes the setting `key` at all."""
-    config = dataclasses.replace(arm_config(arm, parse_all(settings)), arm=(arm,))
-    try:
-        check_read([config], {key: None})
-    except BadInput:
-        return False
-    return key not in FIXED.get(arm, ())
+    config = arm_config(arm, parse_all(settings))
+    return is_read(key, config) and key not in FIXED.get(arm, ())
 
 
 def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
@@ -246,7 +246,8 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
 def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
     """The rules of a filtered arm that a coin which repeats its drop rates has to share."""
     theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, coin))
-    rules = {name: theirs[name] for name in SHARED_RULES if name not in FIXED[coin.arm]}
+    shared = fields_with("rule_of_experiment")
+    rules = {name: theirs[name] for name in shared if name not in FIXED[coin.arm]}
     return {
         name: theirs[name]
         for name in rules
@@ -255,16 +256,18 @@ def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
 
 
 def check(arm: Arm, task: str) -> Config:
-    """The config of a run of `arm`; a random-drop arm's source is settled later.
+    """Resolves the config of a run of `arm`; see `resolved`."""
+    return resolved(arm, task).config
+
+
+def resolved(arm: Arm, task: str) -> RunConfig:
+    """Resolves a run of `arm`; a random-drop arm's source is settled later.
 
     Raises:
       BadInput: the settings cannot be used; the label is named.
     """
-    given = arm.given(task, arm.seeds)
-    if arm.rates_of is not None:
-        given["drop_rate_from"] = "the source"
     try:
-        return resolve(given)
+        return resolve_run(arm.checked_overrides(task))
     except BadInput as error:
         raise BadInput(f"study, arm {arm.label!r}: {error}") from None
 
