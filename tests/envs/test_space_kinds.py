@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces as gym
 
-from sauna.config.presets import resolve, stored_config
+from sauna.config.presets import resolve
 from sauna.config.settings import to_json
+from sauna.config.stored import stored_config
 from sauna.envs.device.contract import _reader, _writer
 from sauna.envs.spaces import action_writer, describe, observation_reader, read_spaces
 from sauna.system.errors import BadInput

@@ -104,14 +104,10 @@ def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> 
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
     """What of a run's config differs from the defaults: the same for the same training.
 
-    A field that was added since (`BEFORE`) counts if it changes what was done before.
+    The defaults are those of when units got their names.
     """
     config = to_json(check(arm._replace(seeds=seeds), task))
-    usual = {
-        **to_json(Config()),
-        **BEFORE,
-        "arm": ["sauna"],
-    }  # its default when units got their names
+    usual = {**to_json(Config()), **BEFORE, "arm": ["sauna"]}
     return {name: value for name, value in config.items() if value != usual[name]}
 
 
