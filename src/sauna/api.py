@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config import local
 from sauna.config.accepted import translate
-from sauna.config.plugins import is_local, name_of
+from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
 from sauna.config.settings import fields_with
+from sauna.envs.make import check_makes, known_in_this_process_alone
 from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
@@ -19,6 +20,23 @@ from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
 
 PARTS = fields_with("plugin")  # what a user may pass by value
+
+
+def _env_name(env: Any) -> str:
+    """Names an environment; an id that this program registered is a part of this process.
+
+    Raises:
+      BadInput: it is an environment itself, or makes none.
+    """
+    if isinstance(env, str):
+        if not known_in_this_process_alone(env):
+            return env
+        import gymnasium
+
+        return name_of(partial(gymnasium.make, env, disable_env_checker=True))
+    name = name_of(env)
+    check_makes(name, env)
+    return name
 
 
 class Result:
@@ -64,7 +82,7 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
       BadInput: a setting is not usable; nothing was created.
       SaunaError: training failed; the last good checkpoint is on disk.
     """
-    overrides = translate({"env": name_of(env), **{n: _named(n, v) for n, v in settings.items()}})
+    overrides = translate({"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}})
     if overrides.get("out") is not None:
         overrides["out"] = str(overrides["out"])
     display: Display = _Silent() if quiet else make_display()
@@ -117,7 +135,7 @@ def compare(
     """
     from sauna.experiments.study.command import compare_command, comparison, study
 
-    overrides = {"env": name_of(env), **{n: _named(n, v) for n, v in settings.items()}}
+    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
     for name in PARTS:
         if is_local(str(overrides.get(name))):
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
@@ -141,44 +159,32 @@ def resume(
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    rest = _provide(Path(path), changes)
+    rest = provide(Path(path), changes, PARTS)
     run = runs.reopen(Path(path), rest, display)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
-def load(path: str | Path, member: int | str = 0, **parts: Any) -> Any:
-    """The policy of a run's newest good checkpoint, as `policy(observation) -> action`.
+def load(
+    path: str | Path, member: int | str = 0, *, checkpoint: int | None = None, **parts: Any
+) -> Any:
+    """The policy of a run, as `policy(observation) -> action`.
 
     The action is the most likely one; `policy(observation, deterministic=False, key=...)` samples.
-    `parts` are those that were passed by value when the run started (`env`, `network`, ...).
+
+    Args:
+      path: the run directory.
+      member: name (`sauna/0`) or index.
+      checkpoint: the iteration of a kept checkpoint; default the newest good one.
+      **parts: those that were passed by value when the run started (`env`, `network`, ...).
     """
-    _provide(Path(path), parts)
+    provide(Path(path), parts, PARTS)
     from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
-    return TrainedPolicy(load_artifact(Path(path)), member)
+    return TrainedPolicy(load_artifact(Path(path), iteration=checkpoint), member)
 
 
 def _named(name: str, value: Any) -> Any:
     """Names a part that was passed by value; other values stay."""
     return name_of(value) if name in PARTS and value is not None else value
-
-
-def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:
-    """Puts parts passed by value where the run's config looks for them; returns the rest.
-
-    Raises:
-      BadInput: a part is given that the run finds by name, or one is missing.
-    """
-    config = run_directory.read_config(path).get("config", {})
-    for name in PARTS:
-        attribute = str(config.get(name)).partition(":")[2]
-        if is_local(str(config.get(name))):
-            if name in given:
-                setattr(local, attribute, given[name])
-            elif not hasattr(local, attribute):
-                raise BadInput(f"{name}: was passed by value; pass it again as {name}=...")
-        elif name in given:
-            raise BadInput(f"{name}: the run finds its own by name ({config.get(name)})")
-    return {name: value for name, value in given.items() if name not in PARTS}

@@ -32,7 +32,9 @@ from sauna.config.presets import (
 )
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
+from sauna.experiments.evaluate import MAX_STEPS
 from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.supported import check_system
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
 # Where a comparison or a study trains.
@@ -92,10 +94,11 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate.add_argument("run", metavar="RUN", help="run directory")
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
-    text = "the most likely action (default: sampled, as in training)"
-    evaluate.add_argument("--deterministic", action="store_true", help=text)
-    evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
+    text = "keyword arguments of the environment, as a JSON object; they change the run's own"
+    evaluate.add_argument("--env-kwargs", metavar="JSON", help=text)
+    text = "the iteration of a kept checkpoint (default: the newest)"
+    evaluate.add_argument("--checkpoint", metavar="N", help=text)
     evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
@@ -103,12 +106,16 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     inspect.add_argument("run", metavar="RUN", help="run directory")
     inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
     inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")
-    text = "the most likely action (default: sampled, as in training)"
-    inspect.add_argument("--deterministic", action="store_true", help=text)
-    inspect.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
-    inspect.add_argument("--no-frames", action="store_false", dest="frames", help="draw nothing")
+    text = f"env steps after which an episode is cut (default {MAX_STEPS})"
+    for command in (evaluate, inspect):
+        command.add_argument("--max-steps", metavar="N", default=str(MAX_STEPS), help=text)
+        most_likely = "the most likely action (default: sampled, as in training)"
+        command.add_argument("--deterministic", action="store_true", help=most_likely)
+        command.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
+    text = "leave the frames out: needs no renderer"
+    inspect.add_argument("--no-frames", action="store_false", dest="frames", help=text)
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
@@ -187,6 +194,7 @@ def _fail(message: object, code: int) -> NoReturn:
 
 
 def _run(arguments: list[str]) -> None:
+    check_system()
     parser = make_parser(arguments)
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
@@ -258,34 +266,35 @@ def _resume(values: dict[str, Any]) -> None:
 
 def _eval(values: dict[str, Any]) -> None:
     run = Path(values.pop("run"))
-    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("PJRT_NPROC", "1")
-    from sauna.experiments.evaluate.episodes import choose_renderer, evaluate
+    _set_up_playing(values)
+    from sauna.experiments.evaluate.episodes import VideoFailure, evaluate, report
+    from sauna.experiments.evaluate.video import choose_renderer
 
     if values["video"]:
         choose_renderer()
-    result = evaluate(run, **values)
-    print(
-        f"{result['env']}, {result['mode']} actions, frozen normaliser, "
-        f"checkpoint of iteration {result['iteration']}"
-    )
-    for name, row in result["members"].items():
-        print(
-            f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
-            f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
-            f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
-            f"{row['episodes']} episodes"
-        )
+    try:
+        result = evaluate(run, **values)
+    except VideoFailure as error:
+        print("\n".join(report(error.result)), flush=True)
+        raise
+    print("\n".join(report(result)))
     if "video" in result:
         print(f"video: {result['video']}")
 
 
-def _inspect(values: dict[str, Any]) -> None:
-    run = Path(values.pop("run"))
-    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
+def _set_up_playing(values: dict[str, Any]) -> None:
+    """Reads the numbers of `eval` and `inspect`, and keeps JAX to one thread of the CPU."""
+    least = {"episodes": 1, "seed": 0, "max_steps": 1}
+    if values.get("checkpoint") is not None:
+        least["checkpoint"] = 0
+    values |= {name: _whole(values, name, number) for name, number in least.items()}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
+
+
+def _inspect(values: dict[str, Any]) -> None:
+    run = Path(values.pop("run"))
+    _set_up_playing(values)
     from sauna.experiments.inspect.command import inspect
 
     path = inspect(run, **values, say=_say)

@@ -121,7 +121,7 @@ def until(run: Path, hook: Hook, world: str = WORLD) -> BaseException | None:
     try:
         with watched(run, hook):
             go(run, world)
-    except (Crash, Exception) as error:
+    except (Crash, KeyboardInterrupt, Exception) as error:
         return error
     return None
 

@@ -87,8 +87,22 @@ def _json_object(name: str, value: Any) -> str:
     if not isinstance(parsed, dict):
         raise ValueError
     try:
-        return json.dumps(parsed, sort_keys=True, allow_nan=False)
+        return json.dumps(parsed, sort_keys=True, allow_nan=False, default=_json_value)
     except ValueError:  # which no reader of JSON would take back
         raise BadInput(
             f"{name}: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
         ) from None
+
+
+def _json_value(value: Any) -> Any:
+    """A number or an array of numpy or JAX as JSON has it.
+
+    Raises:
+      BadInput: it is something else.
+    """
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise BadInput(
+        f"env_kwargs: a {type(value).__name__} is no JSON value; pass env as a function that "
+        "sets it, such as lambda: MyEnv(...)"
+    )

@@ -29,7 +29,7 @@ class ProcessEnvs(HostEnvs):
       seeds: `(member seed, env index)` of each environment.
       processes: number of workers.
       timeout: seconds after which a silent worker counts as hung.
-      backend: of each worker; see `in_process_envs`.
+      backend, rescale: of each worker; see `in_process_envs`.
     """
 
     def __init__(
@@ -40,6 +40,7 @@ class ProcessEnvs(HostEnvs):
         processes: int,
         timeout: float,
         backend: str = "auto",
+        rescale: bool = False,
     ) -> None:
         self._timeout = timeout
         self._parts = np.array_split(np.arange(len(seeds)), processes)
@@ -55,6 +56,7 @@ class ProcessEnvs(HostEnvs):
                         "kwargs": env_kwargs,
                         "seeds": chosen,
                         "backend": backend,
+                        "rescale": rescale,
                     }
                 )
             except BrokenPipeError:
@@ -156,7 +158,8 @@ def main() -> None:
     try:
         header = receive(inbox).header
         seeds = [(int(a), int(b)) for a, b in header["seeds"]]
-        envs = in_process_envs(header["env"], header["kwargs"], seeds, header["backend"])
+        how = header["backend"], header["rescale"]
+        envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
         while True:
             send(outbox, {"kind": "answer"}, _serve(envs, receive(inbox)))

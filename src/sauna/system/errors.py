@@ -14,8 +14,11 @@ class BadInput(SaunaError):
     """The user asked for something that cannot be done (exit code 2, nothing created)."""
 
 
-class Interrupted(SaunaError):
-    """A signal stopped the run after its state was saved (exit code 128 + signal)."""
+class Interrupted(KeyboardInterrupt):
+    """A signal stopped the run after its state was saved (exit code 128 + signal).
+
+    It is no `Exception`: a loop over runs that goes on after one failed stops here.
+    """
 
     def __init__(self, signal_number: int, message: str) -> None:
         super().__init__(message)

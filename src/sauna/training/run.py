@@ -6,7 +6,6 @@ once, and the training itself happens in the workers that `coordinator.py` start
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
 from sauna.config.stored import read_stored, to_stored
-from sauna.envs.spaces import Spaces
+from sauna.envs.spaces import Spaces, same_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
@@ -196,7 +195,7 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     if (changed.config.backend == "device") != (before.config.backend == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
     prepared = examine(changed, changes)
-    if stored.get("spaces") != json.loads(json.dumps(prepared.spaces)):
+    if not same_spaces(stored.get("spaces"), prepared.spaces):
         raise BadInput(
             f"{prepared.config.env} has other spaces than when the run started: "
             f"{prepared.spaces} instead of {stored.get('spaces')}"

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, fields_with, to_json
+from sauna.envs.spaces import read_spaces, same_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.training.coordinator import Coordinator
@@ -85,14 +87,16 @@ def _check_same(path: Path, ours: dict[str, Any], manifest: dict[str, Any]) -> N
     Raises:
       BadInput: with every field that differs.
     """
-    stored = {**to_json(Config()), **manifest["config"]}  # a field added since had its default
+    stored = {**to_json(Config()), **BEFORE, **manifest["config"]}
     free = (*fields_with("resumable"), "out")
     differing = [
         f"{name} is {stored[name]!r}, not {value!r}"
         for name, value in ours["config"].items()
         if name not in free and stored[name] != value
     ]
-    for name in ("arms", "spaces", "members"):
+    if not same_spaces(manifest["spaces"], read_spaces(ours["spaces"])):
+        differing.append("spaces differ")
+    for name in ("arms", "members"):
         if manifest[name] != json.loads(json.dumps(ours[name])):
             differing.append(f"{name} differ")
     if differing:

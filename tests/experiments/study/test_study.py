@@ -24,7 +24,6 @@ from sauna.config.presets import ARMS, COMPARED
 from sauna.config.settings import parse
 from sauna.envs.spaces import describe
 from sauna.experiments.measure.measurement import find_measurement
-from sauna.experiments.report import style
 from sauna.experiments.study.command import compare_command, comparison
 from sauna.experiments.study.execute.process import UnitProcess
 from sauna.experiments.study.results import _ended

@@ -174,6 +174,6 @@ def _largest(logits: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
 
 def make_actor(config: Config, spaces: Spaces, policy: Policy, act: Any, members: int) -> Actor:
     """The fastest actor for the network of `config`."""
-    if config.network == "mlp":
+    if config.network == "mlp" and spaces.observation_kind != "image":
         return MLPActor(config, spaces, policy, members)
     return CompiledActor(act)

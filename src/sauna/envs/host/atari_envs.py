@@ -49,6 +49,11 @@ def names() -> list[str]:
     return sorted(name for name in gymnasium.registry if is_atari(name))
 
 
+def known_games() -> list[str]:
+    """All games, or none where ale-py is not installed."""
+    return names() if importlib.util.find_spec("ale_py") is not None else []
+
+
 def game_of(env: str) -> str:
     """ale-py's name of a game: `ALE/MsPacman-v5` is `ms_pacman`.
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sauna.envs.host.answers import close, life_lost, one_number, reset_with
 from sauna.envs.host.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.system.errors import SaunaError, one_line
@@ -39,14 +40,17 @@ class GymnasiumEnvs(HostEnvs):
     Args:
       make: makes one environment.
       seeds: `(member seed, env index)` of each environment.
+      rescale: as of `action_writer`.
     """
 
-    def __init__(self, make: Callable[[], Any], seeds: Sequence[tuple[int, int]]) -> None:
+    def __init__(
+        self, make: Callable[[], Any], seeds: Sequence[tuple[int, int]], rescale: bool = False
+    ) -> None:
         self._slots = [Slot(make(), pair) for pair in seeds]
         env = self._slots[0].env
         self.spaces = describe(env.observation_space, env.action_space)
         self._read = observation_reader(env.observation_space)
-        self._write = action_writer(env.action_space)
+        self._write = action_writer(env.action_space, rescale)
         number, shape = len(self._slots), self.spaces.observation_shape
         dtype = np.uint8 if self.spaces.observation_kind == "image" else np.float64
         self._observation = np.zeros((number, *shape), dtype)
@@ -68,7 +72,8 @@ class GymnasiumEnvs(HostEnvs):
         slot.episode += 1
         slot.actions = []
         try:
-            observation, _ = slot.env.reset(seed=episode_seed(*slot.seeds, slot.episode))
+            seed = episode_seed(*slot.seeds, slot.episode)
+            observation = reset_with(slot.env, seed)
         except Exception as error:
             raise EnvironmentFailure(f"{slot.name}: reset raised {one_line(error)}") from error
         self._put(self._observation, index, observation)
@@ -116,10 +121,11 @@ class GymnasiumEnvs(HostEnvs):
         """Steps one environment; whether its episode ended, or a life of it was lost."""
         slot.actions.append(action)
         try:
-            observation, reward, terminated, truncated, info = self._take(slot, action)
+            observation, given, terminated, truncated, info = self._take(slot, action)
+            self._reward[index] = one_number(given)
+            lost = life_lost(info)
         except Exception as error:
             raise EnvironmentFailure(f"{slot.name}: step raised {one_line(error)}") from error
-        self._reward[index] = reward
         if terminated or truncated:
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
@@ -129,7 +135,7 @@ class GymnasiumEnvs(HostEnvs):
             self._start_episode(index, slot)
             return True
         self._put(self._observation, index, observation)
-        self._life_lost[index] = lost = bool(info.get("life_lost", False))
+        self._life_lost[index] = lost
         return lost
 
     def _check_finite(self, active: np.ndarray) -> None:
@@ -180,4 +186,4 @@ class GymnasiumEnvs(HostEnvs):
 
     def close(self) -> None:
         for slot in self._slots:
-            slot.env.close()
+            close(slot.env, slot.name)

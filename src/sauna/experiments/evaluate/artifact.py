@@ -34,12 +34,16 @@ def load_artifact(
     """Reads a run's newest good checkpoint, or the one of an iteration.
 
     Raises:
-      BadInput: no run there, or no checkpoint yet.
+      BadInput: no run there, no checkpoint yet, or none of that iteration.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
     run_directory.read_config(run)
+    kept = [int(path.name) for path in checkpoint.numbered(run / "checkpoints")]
     if iteration is None:
         loaded = checkpoint.load_newest(run / "checkpoints", warn)
+    elif iteration not in kept:
+        known = ", ".join(map(str, kept)) or "none"
+        raise BadInput(f"checkpoint: {run} keeps none of iteration {iteration} (it has: {known})")
     else:
         loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     if loaded is None:
@@ -73,4 +77,5 @@ def check_spaces(artifact: Artifact, env: Any) -> None:
         ours, theirs = getattr(artifact.spaces, part), getattr(found, part)
         if ours != theirs:
             kind = part.split("_")[0]
-            raise BadInput(f"env: the run's {kind} space is {ours}, this environment's {theirs}")
+            text = f"env: the run's {kind} space is {ours}, this environment's {theirs}"
+            raise BadInput(" ".join(text.split()))

@@ -11,6 +11,7 @@ import numpy as np
 
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
+from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
 from sauna.envs.spaces import action_writer, observation_reader
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member
@@ -39,9 +40,9 @@ class TrainedPolicy:
         env = env or make_env(self.config.env, json.loads(self.config.env_kwargs))
         check_spaces(artifact, env)
         self._read = observation_reader(env.observation_space)
-        self._write = action_writer(env.action_space)
+        self._write = action_writer(env.action_space, self.config.rescale_actions)
         if made:
-            env.close()
+            close(env)
         own = under(self.name + "/", artifact.checkpoint.arrays)
         self._policy: Policy = make_policy(self.config, artifact.spaces)
         example = jax.eval_shape(self._policy.init, jax.random.key(0))
@@ -68,7 +69,7 @@ class TrainedPolicy:
         return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
 
     def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
-        """The action for one raw observation, clipped as the environment wants it.
+        """The action for one raw observation, clipped or stretched as the environment wants it.
 
         Sampled actions need a JAX `key`; the normaliser is never updated.
         """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import find_member, load_artifact
 from sauna.system.errors import BadInput
 
@@ -18,6 +19,7 @@ def inspect(
     seed: int = 0,
     out: str | Path | None = None,
     frames: bool = True,
+    max_steps: int = MAX_STEPS,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Plays episodes with a member's policy and writes one self-contained page about them.
@@ -29,6 +31,7 @@ def inspect(
       deterministic: the distribution's mode; otherwise actions are sampled, as in training.
       out: the page; default `RUN/inspect_MEMBER_MODE.html`.
       frames: draw the environment; where that fails, one line says so and the page has none.
+      max_steps: env steps after which an episode that has not ended is cut.
       say: receives a line for each checkpoint that cannot be trusted, and for missing frames.
 
     Returns:
@@ -38,8 +41,8 @@ def inspect(
       BadInput: no such run or member, impossible numbers, or a page that cannot be put there.
     """
     run = Path(run)
-    if episodes < 1 or seed < 0:
-        raise BadInput("episodes: must be at least 1, and seed at least 0")
+    if episodes < 1 or seed < 0 or max_steps < 1:
+        raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
     artifact = load_artifact(run, say)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"
@@ -49,6 +52,6 @@ def inspect(
     from sauna.experiments.inspect.inspection import examine  # imports JAX, so after the checks
     from sauna.experiments.inspect.page import make_page
 
-    found = examine(run, artifact, name, episodes, deterministic, seed, frames, say)
+    found = examine(run, artifact, name, episodes, deterministic, seed, frames, say, max_steps)
     path.write_text(make_page(found, run), encoding="utf-8")
     return path

@@ -15,11 +15,14 @@ from sauna.algorithm.policy.normalize import Moments, scale_rewards
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.evaluate.video import frames_per_second
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
-from sauna.experiments.inspect.recording import Played, clock, open_env, play_episodes, play_steps
+from sauna.experiments.inspect.recording import Played, open_env, play_episodes, play_steps
 from sauna.system import run_directory
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under
@@ -58,6 +61,7 @@ def examine(
     seed: int,
     frames: bool,
     say: Callable[[str], None],
+    max_steps: int = MAX_STEPS,
 ) -> Inspection:
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
@@ -67,9 +71,9 @@ def examine(
     kwargs = json.loads(config.env_kwargs)
     env, drawer = open_env(config.env, kwargs, frames, say)
     policy = TrainedPolicy(artifact, name, env)
-    played = play_episodes(policy, env, episodes, deterministic, seed, drawer)
-    steps_per_second = clock(env)
-    env.close()
+    played = play_episodes(policy, env, episodes, deterministic, seed, drawer, max_steps, say)
+    steps_per_second = frames_per_second(env)
+    close(env)
     own = under(name + "/", artifact.checkpoint.arrays)
     hypers = hypers_of(run, config, everyone.index(member), iteration, own)
     steps, number = len(played.reward), environments(config)
@@ -77,7 +81,7 @@ def examine(
     for n in range(1, number):
         env = make_env(config.env, kwargs)
         seen.append(play_steps(policy, env, steps, deterministic, seed, n))
-        env.close()
+        close(env)
     value, own_vex = policy.predict(played.observation)
     vex = np.stack([own_vex, *(policy.predict(x)[1] for x in seen[1:])], 1)
     key = jax.random.fold_in(member_keys(member.seed).filter, iteration)

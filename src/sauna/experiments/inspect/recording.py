@@ -9,10 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.envs.host.answers import life_lost, one_number
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.make import make_drawn_env, make_env
-from sauna.experiments.evaluate.episodes import choose_renderer, not_drawn, play
+from sauna.experiments.evaluate import MAX_STEPS
+from sauna.experiments.evaluate.play import Progress, play
 from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.evaluate.video import choose_renderer, frames_per_second, not_drawn
 from sauna.system.errors import BadInput, SaunaError
 
 SIDE = 192  # pixels of a frame's longer side
@@ -43,7 +46,7 @@ class Frames:
     def __init__(self, env: Any, say: Callable[[str], None]) -> None:
         self._env, self._say = env, say
         limit = getattr(getattr(env, "spec", None), "max_episode_steps", None) or 1
-        self._every = max(1, -(-limit // MAX_FRAMES), round(clock(env) / PER_SECOND))
+        self._every = max(1, -(-limit // MAX_FRAMES), round(frames_per_second(env) / PER_SECOND))
         self._works = True
         self.taken: list[tuple[int, bytes]] = []
 
@@ -73,16 +76,21 @@ def _encoded(drawn: Any) -> bytes:
     return data.getvalue()
 
 
-def clock(env: Any) -> float:
-    """Returns env steps in a second of the environment's own time."""
-    return float((getattr(env, "metadata", None) or {}).get("render_fps") or 30)
-
-
 class Recorder:
-    """An environment that notes what it is asked and what it answers."""
+    """An environment that notes what it is asked and what it answers.
 
-    def __init__(self, env: Any, policy: TrainedPolicy, frames: Frames | None) -> None:
+    It truncates an episode of `max_steps` env steps that has not ended.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        policy: TrainedPolicy,
+        frames: Frames | None,
+        max_steps: int = MAX_STEPS,
+    ) -> None:
         self._env, self._see, self._frames = env, policy.see, frames
+        self._max_steps, self._steps = max_steps, 0
         self._now: Any = None
         self.observation: list[np.ndarray] = []
         self.final: list[np.ndarray] = []
@@ -90,6 +98,7 @@ class Recorder:
 
     def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
         observation, info = self._env.reset(seed=seed)
+        self._steps = 0
         self._now = self._see(observation)
         return observation, info
 
@@ -98,9 +107,9 @@ class Recorder:
             self._frames.take(len(self.transitions))
         observation, reward, terminated, truncated, info = self._env.step(action)
         self.observation.append(self._now)
-        lost = bool(info.get("life_lost", False))
-        truncated = bool(truncated and not terminated)
-        self.transitions.append((float(reward), bool(terminated), truncated, lost))
+        self._steps += 1
+        truncated = bool((truncated or self._steps == self._max_steps) and not terminated)
+        self.transitions.append((one_number(reward), bool(terminated), truncated, life_lost(info)))
         self._now = self._see(observation)
         if terminated or truncated:
             self.final.append(self._now)
@@ -135,10 +144,16 @@ def play_episodes(
     deterministic: bool,
     seed: int,
     frames: Frames | None,
+    max_steps: int = MAX_STEPS,
+    say: Callable[[str], None] = print,
 ) -> Played:
     """Returns the episodes that `evaluate` plays with this seed."""
-    recorder = Recorder(env, policy, frames)
-    returns = [play(policy, recorder, deterministic, seed + i)[0] for i in range(episodes)]
+    recorder = Recorder(env, policy, frames, max_steps)
+    progress, returns = Progress(policy.name, episodes, say), []
+    for i in range(episodes):
+        episode = play(policy, recorder, deterministic, seed + i, progress.step, max_steps)
+        returns.append(progress.played(episode).return_)
+    progress.say_cut(max_steps)
     return _played(recorder, returns, frames)
 
 
@@ -146,9 +161,15 @@ def play_steps(
     policy: TrainedPolicy, env: Any, steps: int, deterministic: bool, seed: int, number: int
 ) -> np.ndarray:
     """Returns what the network gets in `steps` env steps of environment `number`, `[L, *obs]`."""
-    recorder, episode = Recorder(env, policy, None), 0
+    recorder, episode = Recorder(env, policy, None, steps), 0
     while len(recorder.transitions) < steps:
-        play(policy, recorder, deterministic, episode_seed(seed, number, episode))
+        play(
+            policy,
+            recorder,
+            deterministic,
+            episode_seed(seed, number, episode),
+            max_steps=steps,
+        )
         episode += 1
     return np.stack(recorder.observation[:steps])
 

@@ -122,7 +122,8 @@ def fresh_streams(
     random = np.random.default_rng(roots)
     seeds = [int(seed) for seed in roots.generate_state(number)]
     pairs = [(seed, n) for seed in seeds for n in range(config.envs)]
-    made = in_process_envs(config.env, json.loads(config.env_kwargs), pairs, config.backend)
+    how = config.backend, config.rescale_actions
+    made = in_process_envs(config.env, json.loads(config.env_kwargs), pairs, *how)
     envs = _Recorded(made)
     try:
         collector = HostCollector(

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, to_json
 from sauna.experiments.study.spec import Arm, Spec, check
 from sauna.system import run_directory
@@ -103,9 +104,12 @@ def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> 
 
 
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
-    """What of a run's config differs from the defaults: the same for the same training."""
+    """What of a run's config differs from the defaults: the same for the same training.
+
+    The defaults are those of when units got their names.
+    """
     config = to_json(check(arm._replace(seeds=seeds), task))
-    usual = {**to_json(Config()), "arm": ["sauna"]}  # its default when units got their names
+    usual = {**to_json(Config()), **BEFORE, "arm": ["sauna"]}
     return {name: value for name, value in config.items() if value != usual[name]}
 
 

@@ -114,7 +114,7 @@ def _settings(job: Job) -> str:
 def make_population(job: Job) -> Population:
     """The job's members at the start of their training."""
     config = job.config
-    env = flat(make_jax_env(config.env, job.env_kwargs))
+    env = flat(make_jax_env(config.env, job.env_kwargs), config.rescale_actions)
     longest = max((len(rates) for rates in job.drop_rates), default=1)
     settings = [
         _setting(
