@@ -25,7 +25,6 @@ from sauna.system.errors import BadInput, SaunaError
 
 # A value of the same type that is another one, where adding 1 would not be.
 OTHERS = {
-    "env_kwargs": {"speed": 2},
     "arm": ["sauna"],
     "seeds": [7],
     "preset": "mujoco-release",
@@ -77,6 +76,8 @@ def _change_setting(whole: Path, run: Path, name: str, tally: Tally) -> None:
 def _other(name: str, value: Any) -> Any:
     if name == "env":
         return {"worlds:Scripted": "worlds:Forgetful"}.get(value, "jax_worlds:broken")
+    if name.endswith("_kwargs"):
+        return {"speed": 2}
     if name in OTHERS:
         return OTHERS[name]
     if FIELDS[name].metadata["choices"]:
