@@ -18,6 +18,7 @@ from sauna import __version__
 from sauna.config.accepted import translate
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint
+from sauna.config.parsing import whole_number
 from sauna.config.presets import (
     ARM_HELP,
     COMPARED,
@@ -287,7 +288,7 @@ def _set_up_playing(values: dict[str, Any]) -> None:
     least = {"episodes": 1, "seed": 0, "max_steps": 1}
     if values.get("checkpoint") is not None:
         least["checkpoint"] = 0
-    values |= {name: _whole(values, name, number) for name, number in least.items()}
+    values |= {name: whole_number(values, name, number) for name, number in least.items()}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
 
@@ -299,12 +300,6 @@ def _inspect(values: dict[str, Any]) -> None:
 
     path = inspect(run, **values, say=_say)
     print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)")
-
-
-def _whole(values: dict[str, Any], name: str, least: int) -> int:
-    if not values[name].isdigit() or int(values[name]) < least:
-        raise BadInput(f"{name}: must be a whole number of at least {least}")
-    return int(values[name])
 
 
 def _compare(values: dict[str, Any]) -> None:
@@ -341,7 +336,7 @@ def _study(values: dict[str, Any]) -> None:
 def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
     from sauna.experiments.study.command import lines, study
 
-    jobs = _whole({"processes": processes}, "processes", 0)
+    jobs = whole_number({"processes": processes}, "processes", 0)
     summary = study(spec, Path(out), command, jobs, on, address)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
@@ -355,48 +350,9 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, ad
 
 
 def _bench(values: dict[str, Any]) -> None:
-    import json
+    from sauna.experiments.bench.flags import bench_from_flags
 
-    scale = values.pop("scale")
-    fixed = ("iterations", "seed", "seeds", "processes", "envs", "rollout_steps", "hidden")
-    unread = [name for name in fixed if name in values] + ["against"] * bool(values["against"])
-    if scale and unread:
-        raise BadInput(f"{unread[0]}: not read with --scale")
-    values.setdefault("iterations", "50")
-    rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 2)
-    against, file = values.pop("against"), values.pop("json")
-    if file and not Path(file).resolve().parent.is_dir():
-        raise BadInput(f"json: {Path(file).parent} is not a folder")
-    script = values["script"]
-    if (against == "cleanrl") != bool(script) or (script and not Path(script).is_file()):
-        raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
-    for name in ("rounds", "iterations", "script"):
-        del values[name]
-    overrides = {"seeds": 6, **translate({"arm": "ppo", **values})}
-    from sauna.config.presets import plain, resolve_run
-    from sauna.experiments.bench.command import bench, bench_scale, report
-    from sauna.experiments.bench.device import bench_on_device, report_on_device, scale_on_device
-    from sauna.training.prepare import place
-
-    native = place(resolve_run(plain(overrides))).config.backend == "device"
-    if native and scale:
-        result = scale_on_device(overrides, rounds, iterations, _say)
-    elif native:
-        result = bench_on_device(
-            overrides, rounds=rounds, iterations=iterations, against=against, say=_say
-        )
-        print("\n".join(report_on_device(result)))
-    elif scale:
-        result = bench_scale(overrides, rounds, _say)
-    else:
-        path = Path(script) if script else None
-        result = bench(
-            overrides, rounds=rounds, iterations=iterations, against=against, script=path, say=_say
-        )
-        print("\n".join(report(result)))
-    if file:
-        Path(file).write_text(json.dumps(result, indent=1) + "\n")
-        print(f"figures: {file}")
+    bench_from_flags(values, _say)
 
 
 def _say(text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import typing
+from collections.abc import Mapping
 from typing import Any
 
 from sauna.system.errors import BadInput
@@ -106,3 +107,14 @@ def _json_value(value: Any) -> Any:
         f"env_kwargs: a {type(value).__name__} is no JSON value; pass env as a function that "
         "sets it, such as lambda: MyEnv(...)"
     )
+
+
+def whole_number(values: Mapping[str, Any], name: str, least: int) -> int:
+    """The text of option `name` as a whole number of at least `least`.
+
+    Raises:
+      BadInput: it is something else.
+    """
+    if not values[name].isdigit() or int(values[name]) < least:
+        raise BadInput(f"{name}: must be a whole number of at least {least}")
+    return int(values[name])
