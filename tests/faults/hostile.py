@@ -33,7 +33,7 @@ def forge(run: Path, blob: bytes | None = None, raw: bytes | None = None, **chan
     """A checkpoint of `blob` whose manifest has `changes` (or is `raw`), digests included."""
     place = run / "checkpoints" / NUMBER
     place.mkdir(parents=True)
-    (run / "config.json").write_text("{}")
+    (run / "config.json").write_text(json.dumps({"config": {}, "spaces": []}))
     blob = good_blob() if blob is None else blob
     (place / "state.safetensors").write_bytes(blob)
     manifest = {

@@ -12,7 +12,7 @@ import math
 import os
 import stat
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn
 
 from sauna.system.errors import SaunaError
 
@@ -40,28 +40,37 @@ class Untrusted(SaunaError):
     """A file is not what it has to be; the message says what is wrong with it."""
 
 
+def open_file(path: Path) -> IO[bytes]:
+    """Opens a regular file for reading.
+
+    Raises:
+      Untrusted: there is no such file, or it is a link or something else.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        why = getattr(error, "strerror", None) or error
+        raise Untrusted(f"{path.name} cannot be read: {why}") from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise Untrusted(f"{path.name} is not a regular file")
+    return os.fdopen(descriptor, "rb")
+
+
 def read_file(path: Path, limit: int) -> bytes:
     """The bytes of a regular file of at most `limit` bytes.
 
     Raises:
       Untrusted: there is no such file, it is a link or something else, or it is larger.
     """
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise Untrusted(f"{path.name} is not a regular file")
-        if status.st_size > limit:
-            raise Untrusted(f"{path.name} has {status.st_size} bytes; at most {limit} are expected")
-        with os.fdopen(descriptor, "rb", closefd=False) as file:
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise Untrusted(f"{path.name} has {size} bytes; at most {limit} are expected")
+        try:
             return file.read(limit + 1)
-    except OSError as error:
-        raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
-    finally:
-        os.close(descriptor)
+        except OSError as error:
+            raise Untrusted(f"{path.name} cannot be read: {error.strerror}") from error
 
 
 def parse_object(data: bytes) -> dict[str, Any]:

@@ -8,12 +8,10 @@ are shared over processes.
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Mapping
 from functools import partial
 from multiprocessing.connection import wait
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +19,7 @@ import numpy as np
 from sauna.config.settings import Config, local_parts, to_json
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.logs import Logs, check_logs
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
 from sauna.system.signals import handled
 from sauna.system.watchdog import Watch
@@ -53,7 +52,8 @@ class Coordinator:
         self._states: list[dict[int, dict[str, np.ndarray]]] = [{} for _ in self._parts]
         self._reached = [self._iteration] * len(self._parts)
         self._ended: list[int | None] = [None] * len(self._parts)
-        self._due: list[tuple[int, dict[str, int]]] = []  # checkpoints waiting for their states
+        self._logs = Logs(run.path)
+        self._due: list[tuple[int, dict[str, Any]]] = []  # checkpoints waiting for their states
         self._lead, self._granted = LEAD, 0
         self._signal: int | None = None
         self._stopping = False
@@ -111,7 +111,7 @@ class Coordinator:
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None
-            self._save(self._last_iteration(), run_directory.log_sizes(self._run.path))
+            self._save(self._last_iteration(), self._logs.counted())
             self._write_summary(complete)
         if not complete:
             raise Interrupted(
@@ -218,7 +218,7 @@ class Coordinator:
             self._write_rows(rows, [m.header["timing"] for m in messages.values()])
             self._iteration += 1
             if self._iteration % self._run.config.checkpoint_every == 0:
-                self._due.append((self._iteration, run_directory.log_sizes(self._run.path)))
+                self._due.append((self._iteration, self._logs.counted()))
         while self._due and self._all_states_of(self._due[0][0]):
             self._save(*self._due.pop(0))
 
@@ -235,7 +235,7 @@ class Coordinator:
             for states, end in zip(self._states, self._ended, strict=True)
         )
 
-    def _save(self, iteration: int, logs: dict[str, int]) -> None:
+    def _save(self, iteration: int, logs: dict[str, Any]) -> None:
         """A checkpoint of all members at (the start of) an iteration, or at their end before it."""
         arrays: dict[str, np.ndarray] = {}
         for states in self._states:
@@ -246,7 +246,7 @@ class Coordinator:
             self._run.path / "checkpoints",
             iteration,
             arrays,
-            {**self._run.manifest(), "logs": logs},
+            {**self._run.manifest(), **logs},
             self._run.config.keep_checkpoints,
         )
 
@@ -261,11 +261,12 @@ class Coordinator:
         }
         if all("collect_seconds" in timing for timing in timings):  # unknown on the device
             timing["collect_seconds"] = max(timing["collect_seconds"] for timing in timings)
-        _append(self._run.path / "metrics.jsonl", rows)
-        _append(self._run.path / "timing.jsonl", [timing])
+        self._logs.append("metrics.jsonl", rows)
+        self._logs.append("timing.jsonl", [timing])
         self._tensorboard.write(rows, timing)
 
     def _write_summary(self, complete: bool) -> None:
+        check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
         last: dict[str, dict[str, Any]] = {}
         for row in run_directory.rows(self._run.path):
             last[row["member"]] = row
@@ -300,8 +301,3 @@ def _environment(config: Config) -> dict[str, str]:
     if config.backend == "device" and config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
     return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
-
-
-def _append(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("a") as file:
-        file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)

@@ -10,6 +10,7 @@ from sauna.config.presets import RESUMABLE
 from sauna.config.settings import Config, to_json
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
+from sauna.system.logs import check_logs, cut_logs, damage_of
 from sauna.training.coordinator import Coordinator
 from sauna.training.display import Display
 from sauna.training.run import Run, disk_errors
@@ -39,13 +40,21 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
 def _train(run: Run, display: Display, resume: bool, inexact: bool) -> None:
     loaded = None
     if resume:
-        if run_directory.is_complete(run.path):
+        if run_directory.is_complete(run.path) and _is_whole(run, display):
             display.say(f"{run.path} is complete; nothing to do")
             return
         loaded = _load(run, display)
-        run_directory.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+        cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
     with Coordinator(run, display, loaded, inexact) as coordinator:
         coordinator.run()
+
+
+def _is_whole(run: Run, display: Display) -> bool:
+    """Whether the rows of a complete run are those that were written; what is not is named."""
+    damage = damage_of(run.path)
+    if damage is not None:
+        display.say(f"warning: {damage}; the run is continued from before that")
+    return damage is None
 
 
 def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
@@ -59,7 +68,7 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
 
     def check(manifest: dict[str, Any]) -> None:
         _check_same(run.path, own, manifest)
-        run_directory.check_logs(run.path, manifest["logs"])
+        check_logs(run.path, manifest)
 
     loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
     before = loaded.manifest.get("versions", {}) if loaded else {}
