@@ -17,6 +17,7 @@ from sauna import __version__
 from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
 from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
 from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
+from sauna.system.tracebacks import user_frames
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
 _PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
@@ -157,6 +158,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _fail(message: object, code: int) -> NoReturn:
+    """Ends with one line, below the frames of the user's own code if that raised."""
+    if isinstance(message, SaunaError) and (frames := user_frames(message)):
+        print(frames, file=sys.stderr)
     print(f"sauna: {message}", file=sys.stderr)
     sys.exit(code)
 

@@ -150,12 +150,12 @@ def read_config_file(path: Path) -> dict[str, Any]:
     Raises:
       BadInput: the file cannot be read as that.
     """
-    return _read(path.resolve())
+    return _read(path, Path(os.path.realpath(path)))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, place: Path | None = None) -> dict[str, Any]:
     try:
-        return parse_object(read_file(path, JSON_BYTES))
+        return parse_object(read_file(place or path, JSON_BYTES))
     except Untrusted as error:
         raise BadInput(f"config: cannot read {path}: {error}") from error
 

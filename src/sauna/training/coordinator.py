@@ -12,6 +12,7 @@ import signal
 from collections.abc import Mapping
 from functools import partial
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,9 @@ from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.system.logs import Logs, check_logs
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
+from sauna.system.safe_write import replace_file
 from sauna.system.signals import handled
+from sauna.system.tracebacks import cause_of
 from sauna.system.watchdog import Watch
 from sauna.training.display import Display
 from sauna.training.tensorboard import TensorBoard
@@ -203,8 +206,7 @@ class Coordinator:
                 self._states[number][header["iteration"]] = message.arrays
                 self._flush()
             case "failure":
-                error = BadInput if header.get("bad_input") else SaunaError
-                raise error(header["message"])
+                raise _failure(self._run.path, header)
             case "done":
                 self._ended[number] = self._reached[number]
                 self._grant()
@@ -294,6 +296,19 @@ class Coordinator:
 def lead_for(seconds: float) -> int:
     """Iterations to grant where one takes `seconds`: a call to the device runs many short ones."""
     return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MOST_AHEAD))
+
+
+def _failure(run: Path, header: dict[str, Any]) -> SaunaError:
+    """The error of a worker's last message; its whole traceback is kept in `failure.txt`."""
+    cause = cause_of(header)
+    if header.get("bad_input"):
+        error: SaunaError = BadInput(header["message"])
+    else:
+        replace_file(run / "failure.txt", header.get("traceback", header["message"]).encode())
+        where = f" (the whole traceback: {run / 'failure.txt'})" if header.get("frames") else ""
+        error = SaunaError(header["message"] + where)
+    error.__cause__ = cause
+    return error
 
 
 def _environment(config: Config) -> dict[str, str]:

@@ -20,6 +20,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -119,6 +120,7 @@ def main() -> int:
     except Interrupted as error:
         return 128 + error.signal_number
     except SaunaError as error:
+        traceback.print_exception(error)
         display.send({"error": str(error)})
         return 1
     finally:
