@@ -16,6 +16,7 @@ from sauna.envs.make import make_drawn_env, make_env
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError, one_line
+from sauna.system.safe_write import own_folder, replacing
 
 if TYPE_CHECKING:
     from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -152,13 +153,13 @@ def film(
 
     mode = "deterministic" if deterministic else "sampled"
     path = run / "videos" / f"{name.replace('/', '-')}_{mode}.mp4"
-    path.parent.mkdir(exist_ok=True)
+    own_folder(path.parent)
     rate = int(world.metadata.get("render_fps", 30))
     world.close()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), replacing(path) as temporary:
         # ffmpeg is started by a fork that executes it at once; JAX warns of forks of any kind.
         warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        imageio.imwrite(path, np.stack(frames), fps=rate, macro_block_size=1)
+        imageio.imwrite(temporary, np.stack(frames), fps=rate, macro_block_size=1)
     return path
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sauna.experiments.evaluate.artifact import find_member, load_artifact
 from sauna.system.errors import BadInput
+from sauna.system.safe_write import replace_file
 
 
 def inspect(
@@ -50,5 +51,5 @@ def inspect(
     from sauna.experiments.inspect.page import make_page
 
     found = examine(run, artifact, name, episodes, deterministic, seed, pictures, say)
-    path.write_text(make_page(found, run), encoding="utf-8")
+    replace_file(path, make_page(found, run).encode())
     return path

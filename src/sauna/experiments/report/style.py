@@ -10,6 +10,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sauna.system.safe_write import own_folder, replacing
+
 # Okabe and Ito's palette, which the colour-blind can tell apart; an arm always has its colour.
 COLOURS = {
     "ppo": "#0072B2",
@@ -144,6 +146,7 @@ def count_steps(axes: Any) -> None:
 
 def save(figure: Any, path: Path) -> Path:
     """Writes a picture whose bytes depend on what it shows alone."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata=_METADATA[path.suffix])
+    own_folder(path.parent)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, metadata=_METADATA[path.suffix])
     return path

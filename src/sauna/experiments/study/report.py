@@ -27,6 +27,7 @@ from sauna.experiments.report.page import filled, rounded
 from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
 from sauna.experiments.study.summary import FILTERING
+from sauna.system.safe_write import replace_file
 
 # A shape beside the colour of each kind of verdict.
 MARKS = {
@@ -55,7 +56,7 @@ def write_report(
     pictures = write_figures(results, summary, folder, extra)
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(make_page(results, summary, pictures, extra), encoding="utf-8")
+    replace_file(path, make_page(results, summary, pictures, extra).encode())
     return path
 
 
