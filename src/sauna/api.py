@@ -37,7 +37,7 @@ class Result:
 
     def policy(self, member: int | str = 0) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`."""
-        return load(self.path, member)
+        return load(self.path, member, trust=True)
 
     def __repr__(self) -> str:
         return f"Result({str(self.path)!r})"
@@ -129,7 +129,12 @@ def compare(
 
 
 def resume(
-    path: str | Path, *, quiet: bool = False, inexact: bool = False, **changes: Any
+    path: str | Path,
+    *,
+    quiet: bool = False,
+    inexact: bool = False,
+    trust: bool = False,
+    **changes: Any,
 ) -> Result:
     """Continues an interrupted run to its end; the result is that of a run left alone.
 
@@ -137,27 +142,29 @@ def resume(
       path: the run directory.
       quiet: show nothing.
       inexact: start new episodes where environments cannot be brought back.
+      trust: the code that the run names may run, even if another user named it.
       **changes: settings that do not touch what is computed (`processes`, ...), and the parts
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
     rest = _provide(Path(path), changes)
-    run = runs.reopen(Path(path), rest, display)
+    run = runs.reopen(Path(path), rest, display, trust)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
-def load(path: str | Path, member: int | str = 0, **parts: Any) -> Any:
+def load(path: str | Path, member: int | str = 0, *, trust: bool = False, **parts: Any) -> Any:
     """The policy of a run's newest good checkpoint, as `policy(observation) -> action`.
 
     The action is the most likely one; `policy(observation, deterministic=False, key=...)` samples.
     `parts` are those that were passed by value when the run started (`env`, `network`, ...).
+    With `trust`, the code that the run names may run, even if another user named it.
     """
     _provide(Path(path), parts)
     from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
-    return TrainedPolicy(load_artifact(Path(path)), member)
+    return TrainedPolicy(load_artifact(Path(path), trust=trust), member)
 
 
 def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:

@@ -73,6 +73,10 @@ def make_parser() -> argparse.ArgumentParser:
     text = "leave the pictures out: needs no renderer"
     inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
 
+    text = "run the code that the file or run names, even if another user named it"
+    for command in (train, resume, evaluate, inspect):
+        command.add_argument("--trust", action="store_true", help=text)
+
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, allow_abbrev=False)
     compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
@@ -85,6 +89,8 @@ def make_parser() -> argparse.ArgumentParser:
         "study", help="run a study of the paper's, or your own", allow_abbrev=False
     )
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
+    text = "run the code that FILE names, even if another user named it"
+    study.add_argument("--trust", action="store_true", help=text)
     for command in (compare, study):
         command.add_argument(
             "--out", default="runs", metavar="DIR", help="where runs and results go (default runs)"
@@ -194,7 +200,7 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    given = _given_from(values.pop("config"))
+    given = _given_from(values.pop("config"), values.pop("trust"))
     env = values.pop("env")
     given |= values | ({"env": env} if env else {})
     display = make_display()
@@ -206,13 +212,19 @@ def _train(values: dict[str, Any]) -> None:
     print(f"learning curve: {run.path}/figures/learning_curve.png")
 
 
-def _given_from(file: str | None) -> dict[str, Any]:
-    """Settings of a `config.json` (of a run), or of a JSON file of plain settings."""
+def _given_from(file: str | None, trust: bool) -> dict[str, Any]:
+    """Settings of a `config.json` (of a run), or of a JSON file of plain settings.
+
+    Raises:
+      BadInput: it cannot be read, or names code of somebody else's, which `trust` allows.
+    """
     if file is None:
         return {}
+    from sauna.config.trust import check_trusted
     from sauna.system.run_directory import read_config_file
 
     stored = read_config_file(Path(file))
+    check_trusted(stored, file, stored.pop("seal", None), trust)
     if "config" in stored and "given" in stored:
         return given_by(stored["config"], stored["given"])
     return stored
@@ -224,8 +236,9 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
 
     path, inexact = Path(values.pop("run")), values.pop("inexact")
+    trust = values.pop("trust")
     display = make_display()
-    run = runs.reopen(path, values, display)
+    run = runs.reopen(path, values, display, trust)
     train_and_draw(run, display, resume=True, inexact=inexact)
 
 
@@ -283,10 +296,11 @@ def _compare(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
-    from sauna.experiments.study.command import load_spec, study_command
+    from sauna.experiments.study.command import check_study, load_spec, study_command
 
-    name = values.pop("study")
-    _run_study(load_spec(name), study_command(name, values["out"]), **values)
+    name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
+    spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
+    _run_study(spec, study_command(name, out), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:

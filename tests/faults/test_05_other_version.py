@@ -170,12 +170,16 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     """Its rows are kept, its policy acts, and it is trained to its end."""
     run = tmp_path / "run"
     shutil.copytree(golden, run)
-    loaded = load_artifact(run)
+    loaded = load_artifact(run, trust=True)
     assert loaded.checkpoint.manifest["format"] == checkpoint.FORMAT
     spaces = loaded.spaces
-    assert sauna.load(run)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
+    with pytest.raises(BadInput, match=r"names code .* give --trust"):
+        sauna.load(run)  # it was made by somebody else, whose key is not here
+    assert (
+        sauna.load(run, trust=True)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
+    )
     with trained_here():
-        sauna.resume(run)
+        sauna.resume(run, trust=True)
     assert run_directory.is_complete(run)
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()

@@ -23,6 +23,7 @@ from sauna.config.presets import (
     stored_config,
 )
 from sauna.config.settings import Config, local_parts, to_json
+from sauna.config.trust import check_trusted, seal
 from sauna.envs.probe import Probe
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -96,6 +97,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
         "git": run_directory.git_revision(),
         "machine": run_directory.machine(),
     }
+    stored["seal"] = seal(stored)
     made = not path.exists()
     with disk_errors(path):
         run_directory.create(path)
@@ -149,13 +151,18 @@ def follow(given: Mapping[str, Any], display: Display) -> None:
     train_members(job, Follower(display.say))
 
 
-def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
-    """An existing run, to be continued.
+def reopen(path: Path, changes: Mapping[str, Any], display: Display, trust: bool = False) -> Run:
+    """An existing run, to be continued; from then on it counts as this user's.
+
+    Args:
+      trust: the code that it names may run, even if another user named it.
 
     Raises:
-      BadInput: it is not a run, is in use, or `changes` would change what is computed.
+      BadInput: it is not a run, is in use, names code of somebody else's, or `changes` would change
+        what is computed.
     """
     stored = run_directory.read_config(path)
+    check_trusted(stored, str(path), stored.get("seal"), trust)
     for name in changes:
         if name not in RESUMABLE:
             raise BadInput(f"{name}: cannot be changed on resume (can: {', '.join(RESUMABLE)})")
@@ -182,7 +189,10 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     if kept:
         display.say(f"note: this version has other values; kept from the start: {', '.join(kept)}")
     with disk_errors(path):
-        return Run(path, {**began, **changes}, config, found, stored["drop_rates"])
+        run = Run(path, {**began, **changes}, config, found, stored.get("drop_rates", []))
+        if trust:
+            run_directory.write_json(path / "config.json", {**stored, "seal": seal(stored)})
+        return run
 
 
 @contextmanager

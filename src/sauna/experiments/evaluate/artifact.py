@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from sauna.config.presets import stored_config
 from sauna.config.settings import Config
+from sauna.config.trust import check_trusted
 from sauna.envs.spaces import Spaces, describe, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
@@ -23,21 +24,26 @@ class Artifact(NamedTuple):
 
 
 def load_artifact(
-    run: Path, warn: Callable[[str], None] = print, iteration: int | None = None
+    run: Path,
+    warn: Callable[[str], None] = print,
+    iteration: int | None = None,
+    trust: bool = False,
 ) -> Artifact:
     """Reads a run's newest good checkpoint, or the one of an iteration.
 
     Raises:
-      BadInput: no run there, or no checkpoint yet.
+      BadInput: no run there, no checkpoint yet, or one that names code of somebody else's, which
+        `trust` allows.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
-    run_directory.read_config(run)
+    stored = run_directory.read_config(run)
     if iteration is None:
         loaded = checkpoint.load_newest(run / "checkpoints", warn)
     else:
         loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     if loaded is None:
         raise BadInput(f"{run} has no checkpoint yet")
+    check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust)
     try:
         spaces = read_spaces(loaded.manifest["spaces"])
     except (TypeError, ValueError, LookupError) as error:

@@ -31,6 +31,7 @@ def evaluate(
     seed: int = 0,
     env: str | None = None,
     video: bool = False,
+    trust: bool = False,
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Plays `episodes` episodes with each member.
@@ -45,6 +46,7 @@ def evaluate(
       seed: episodes are reset with seeds `seed`, `seed + 1`, ...
       env: another environment with the same spaces; default the run's.
       video: also films the first member's first episode.
+      trust: the code that the run names may run, even if another user named it.
       say: is told of checkpoints that cannot be trusted.
 
     Returns:
@@ -57,7 +59,7 @@ def evaluate(
     run = Path(run)
     if episodes < 1 or seed < 0:
         raise BadInput("episodes: must be at least 1, and seed at least 0")
-    artifact = load_artifact(run, say)
+    artifact = load_artifact(run, say, trust=trust)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]
     mode = "deterministic" if deterministic else "sampled"
     result: dict[str, Any] = {

@@ -19,6 +19,7 @@ def inspect(
     seed: int = 0,
     out: str | Path | None = None,
     pictures: bool = True,
+    trust: bool = False,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Plays episodes with a member's policy and writes one self-contained page about them.
@@ -30,6 +31,7 @@ def inspect(
       deterministic: the distribution's mode; otherwise actions are sampled, as in training.
       out: the page; default `RUN/inspect_MEMBER_MODE.html`.
       pictures: draw the environment; where that fails, one line says so and the page has none.
+      trust: the code that the run names may run, even if another user named it.
       say: is told of checkpoints that cannot be trusted, and of missing pictures.
 
     Returns:
@@ -41,7 +43,7 @@ def inspect(
     run = Path(run)
     if episodes < 1 or seed < 0:
         raise BadInput("episodes: must be at least 1, and seed at least 0")
-    artifact = load_artifact(run, say)
+    artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"
     path = Path(out) if out else run / f"inspect_{name.replace('/', '-')}_{mode}.html"

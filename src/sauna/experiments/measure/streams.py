@@ -24,6 +24,7 @@ from sauna.algorithm.rollout.program import Program, make_program
 from sauna.algorithm.types import Array, Hypers, Rollout, member_keys
 from sauna.config.presets import Member, as_began, members, stored_config
 from sauna.config.settings import Config
+from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
 from sauna.system import run_directory
@@ -81,6 +82,7 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     """
     stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
+    check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust=False)
     config = stored_config(loaded.manifest["config"])
     spaces = read_spaces(loaded.manifest["spaces"])
     given = as_began(loaded.manifest["config"], loaded.manifest["given"])

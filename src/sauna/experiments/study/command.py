@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import signal
@@ -14,6 +13,7 @@ from typing import Any
 
 from sauna.config.presets import algorithm_of, chosen_preset
 from sauna.config.settings import Config
+from sauna.config.trust import check_trusted, covers, seal
 from sauna.envs.probe import Probe
 from sauna.envs.spaces import Spaces
 from sauna.experiments.report.numbers import digits_of_tasks, interval, number
@@ -241,10 +241,13 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
     if place.exists() and not place.is_dir():
         raise BadInput(f"out: {place} is no folder")
     if path.is_file():
-        stored = json.loads(path.read_text())
-        if not _is_same(stored["study"], spec):
+        stored = run_directory.read_config_file(path)
+        text, size = stored.get("study"), stored.get("seeds_per_unit")
+        if not isinstance(text, dict) or not isinstance(size, int) or size < 1:
+            raise BadInput(f"out: {path} is not what a study writes")
+        if not covers(spec.text, text) or not _is_same(text, spec):
             raise BadInput(f"study: {place} holds another study of this name; give --out")
-        return int(stored["seeds_per_unit"])
+        return size
     return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
 
 
@@ -254,7 +257,20 @@ def _note(spec: Spec, place: Path, size: int) -> None:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
-    run_directory.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+    run_directory.write_json(
+        place / "study.json", {"study": spec.text, "seeds_per_unit": size, "seal": seal(spec.text)}
+    )
+
+
+def check_study(text: Mapping[str, Any], out: Path, trust: bool) -> None:
+    """Refuses code that a study's file names, unless this user has run it before.
+
+    Raises:
+      BadInput: with everything that is named.
+    """
+    path = out / str(text["name"]) / "study.json"
+    stored = run_directory.read_config_file(path) if path.is_file() else {}
+    check_trusted(text, f"study {text['name']!r}", stored.get("seal"), trust)
 
 
 def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:

@@ -26,6 +26,7 @@ from typing import Any, TextIO
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config, to_json
+from sauna.config.trust import covers
 from sauna.system import run_directory
 from sauna.system.errors import Interrupted, SaunaError
 from sauna.training import run as runs
@@ -83,7 +84,11 @@ def train(given: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay
     while True:
         resume = (path / "config.json").exists()
         try:
-            run = runs.reopen(path, {}, display) if resume else runs.start(given, display)
+            if resume:  # also where it was begun on another machine, for this study
+                trust = covers(given, run_directory.read_config(path))
+                run = runs.reopen(path, {}, display, trust)
+            else:
+                run = runs.start(given, display)
             break
         except (
             run_directory.InUse
