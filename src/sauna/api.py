@@ -79,11 +79,11 @@ def train_and_draw(run: runs.Run, display: Display, *, resume: bool, inexact: bo
       BadInput, Interrupted, SaunaError: as `train_run`.
     """
     try:
-        train_run(run, display, resume=resume, inexact=inexact)
+        if train_run(run, display, resume=resume, inexact=inexact):
+            draw_curve(run.path)
     except Interrupted:
         draw_curve(run.path)
         raise
-    draw_curve(run.path)
 
 
 def compare(

@@ -27,12 +27,12 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 RESULTS = ROOT / "results" / "mutants.json"
 QUICK = (
     "advantages",
-    "batch",
-    "losses",
-    "filters",
-    "vex",
+    "samples",
+    "ppo",
+    "vex_filter",
+    "vex_targets",
     "networks",
-    "collect",
+    "host",
     "reference",
     "properties",
 )
@@ -55,7 +55,7 @@ def _of(file: str, tests: str, *changes: tuple[str, str, str]) -> list[Mutant]:
 
 MUTANTS = [
     *_of(
-        "core/advantages.py",
+        "algorithm/learner/advantages.py",
         "advantages",
         ("value is added", "* next_value - value\n", "* next_value + value\n"),
         ("no bootstrap mask", "gamma * bootstrap * next_value", "gamma * next_value"),
@@ -65,8 +65,8 @@ MUTANTS = [
         ("forwards in time", "reverse=True", "reverse=False"),
     ),
     *_of(
-        "core/batch.py",
-        "advantages batch reference vex",
+        "algorithm/learner/samples.py",
+        "advantages samples reference vex_targets",
         ("dropped steps are kept", "jnp.argsort(~keep", "jnp.argsort(keep"),
         (
             "stream goes on at its end",
@@ -111,8 +111,8 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/losses.py",
-        "losses batch",
+        "algorithm/learner/ppo.py",
+        "ppo samples",
         ("mean over empty slots, too", "jnp.maximum(jnp.sum(weight), 1.0)", "weight.shape[0]"),
         (
             "advantages not centred",
@@ -154,7 +154,7 @@ MUTANTS = [
         ("masked ratios count", "jnp.where(weight > 0, log_ratio, 0.0)", "log_ratio"),
     ),
     *_of(
-        "core/a2c.py",
+        "algorithm/learner/a2c.py",
         "a2c",
         ("flipped advantage", "-log_prob * advantage", "log_prob * advantage"),
         (
@@ -169,14 +169,14 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/update.py",
+        "algorithm/learner/update.py",
         "a2c",
         ("RMSProp starts at 0", "initial_scale=1.0", "initial_scale=0.0"),
         ("epsilon beside the root", "eps_in_sqrt=True", "eps_in_sqrt=False"),
     ),
     *_of(
-        "core/normalize.py",
-        "collect",
+        "algorithm/policy/normalize.py",
+        "host",
         ("spread of the means forgotten", "moments.variance + delta * move", "moments.variance"),
         ("mean moves the wrong way", "Moments(moments.mean + move", "Moments(moments.mean - move"),
         (
@@ -199,8 +199,8 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/update.py",
-        "losses batch faults/test_07_poisoned_batch",
+        "algorithm/learner/update.py",
+        "ppo samples faults/test_07_poisoned_batch",
         (
             "uphill",
             "state.params - hypers.learning_rate * step",
@@ -223,13 +223,13 @@ MUTANTS = [
         ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
     ),
     *_of(
-        "core/update.py",
+        "algorithm/learner/update.py",
         "a2c",
         ("mean square starts at 0", "initial_scale=1.0", "initial_scale=0.0"),
         ("epsilon outside of the root", "eps_in_sqrt=True", "eps_in_sqrt=False"),
     ),
     *_of(
-        "core/a2c.py",
+        "algorithm/learner/a2c.py",
         "a2c",
         ("policy gradient downhill", "weighted_mean(-log_prob", "weighted_mean(log_prob"),
         ("value error halved", "weighted_mean((value", "0.5 * weighted_mean((value"),
@@ -237,7 +237,7 @@ MUTANTS = [
         ("no Vex loss", "vex_loss, mean_entropy, hypers)", "0.0 * vex_loss, mean_entropy, hypers)"),
     ),
     *_of(
-        "core/policy.py",
+        "algorithm/policy/policy.py",
         "networks",
         (
             "value and Vex swapped",
@@ -251,7 +251,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/distributions.py",
+        "algorithm/policy/distributions.py",
         "networks",
         (
             "density not normalised",
@@ -276,7 +276,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/convolutions.py",
+        "algorithm/policy/convolutions.py",
         "networks",
         ("pixels not scaled", "beside.astype(jnp.float32) / 255.0", "beside.astype(jnp.float32)"),
         ("kernel upside down", "@ rows[i] for i", "@ rows[-1 - i] for i"),
@@ -289,7 +289,7 @@ MUTANTS = [
         ("gradient of the last piece only", "jax.tree.map(jnp.add, total, gradients)", "gradients"),
     ),
     *_of(
-        "core/networks.py",
+        "algorithm/policy/networks.py",
         "networks",
         (
             "policy head starts large",
@@ -308,8 +308,8 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/population.py",
-        "batch losses",
+        "algorithm/rollout/program.py",
+        "samples ppo",
         (
             "noise repeats in a rollout",
             "jax.random.fold_in(jax.random.fold_in(root, iteration), block)",
@@ -325,8 +325,8 @@ MUTANTS = [
         ("one key for all members", "jax.random.key(seed)", "jax.random.key(0)"),
     ),
     *_of(
-        "selection/filters.py",
-        "filters batch reference",
+        "algorithm/selection/vex_filter.py",
+        "vex_filter samples reference",
         ("median off by one", "jnp.maximum(history.number - 1, 0) // 2", "history.number // 2"),
         (
             "history does not grow",
@@ -352,8 +352,8 @@ MUTANTS = [
         ("one step too many", "carry[0] < length", "carry[0] <= length"),
     ),
     *_of(
-        "selection/filters.py",
-        "filters dial",
+        "algorithm/selection/vex_filter.py",
+        "vex_filter coverage",
         (
             "held rate pushed away",
             "(state.kept - rate * number) / SETTLE",
@@ -368,14 +368,14 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "core/gradient.py",
+        "experiments/measure/gradient.py",
         "noise",
         ("downhill", "return -jax.grad(loss)(params)", "return jax.grad(loss)(params)"),
         ("never standardised", "if standardized:", "if False:"),
     ),
     *_of(
-        "selection/vex.py",
-        "vex batch",
+        "algorithm/learner/vex_targets.py",
+        "vex_targets samples",
         (
             "unexplained instead of explained",
             "jnp.where(varies, 1.0 - unexplained /",
@@ -526,13 +526,20 @@ def _test(copy: Path, tests: tuple[str, ...], log: Path) -> None:
     sys.path[:0] = [str(copy), str(ROOT / "tests")]
     sys.dont_write_bytecode = True
     _same_examples_each_time()
-    files = [f"tests/{t}.py" if "/" in t else f"tests/test_{t}.py" for t in tests]
+    files = [str(_test_file(t)) for t in tests]
     code = 1
     try:
         code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=short", *files]))
     finally:
         sys.stdout.flush()
         os._exit(code)
+
+
+def _test_file(name: str) -> Path:
+    """`faults/test_07_poisoned_batch`, or a module's name anywhere below `tests/`."""
+    if "/" in name:
+        return ROOT / "tests" / f"{name}.py"
+    return next((ROOT / "tests").rglob(f"test_{name}.py"))
 
 
 def _same_examples_each_time() -> None:

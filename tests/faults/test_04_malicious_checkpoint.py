@@ -101,6 +101,7 @@ def main() -> None:
     import gymnasium
     import safetensors.numpy
 
+    import sauna.envs.host.gymnasium_envs
     import sauna.envs.make
     import sauna.experiments.evaluate.artifact
     from sauna.system.errors import SaunaError

@@ -23,6 +23,7 @@ from sauna.system import checkpoint, run_directory
 from sauna.system.checkpoint import NotFinite, save_checkpoint
 from sauna.system.errors import SaunaError
 from sauna.training.loop import host
+from sauna.training.loop.job import NonFinite
 
 FIELDS = ("observation", "action", "log_prob", "advantage", "return_", "value", "vex_target")
 VALUES = (np.nan, np.inf, -np.inf)
@@ -139,6 +140,6 @@ def test_parameters_are_checked_where_the_loss_was_still_finite() -> None:
 
 def test_a_rate_that_overflows_stops_before_anything_is_saved() -> None:
     recorder = Recorder()
-    with pytest.raises(host.NonFinite, match="iteration 0"):
+    with pytest.raises(NonFinite, match="iteration 0"):
         host.train_members(make_job("worlds:Scripted", learning_rate=1e38), recorder)
     assert not recorder.rows and not recorder.states

@@ -209,12 +209,8 @@ def wrong_study(rng: random.Random) -> Mistake:
             Mistake([*STUDY], "cannot read", "tasks = ["),
             Mistake([*STUDY], "unknown key", f'task = ["x"]\n{arm}'),
             Mistake([*STUDY], "no arms", start),
-            Mistake(
-                [*STUDY], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'
-            ),
-            Mistake(
-                [*STUDY], "minibatches", f"minibatches = 7\n{start}{arm}"
-            ),
+            Mistake([*STUDY], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'),
+            Mistake([*STUDY], "minibatches", f"minibatches = 7\n{start}{arm}"),
             Mistake(
                 [*STUDY],
                 "gamma",

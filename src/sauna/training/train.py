@@ -16,8 +16,8 @@ from sauna.training.display import Display
 from sauna.training.run import Run, disk_errors
 
 
-def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> None:
-    """Trains a run to its end; returns when everything is written.
+def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> bool:
+    """Trains a run to its end; returns, when everything is written, whether there was any to do.
 
     Raises:
       BadInput: a setting cannot be used after all, as a worker found; a new run is removed again.
@@ -28,7 +28,7 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
         if inexact and run.config.backend == "device":
             raise BadInput("inexact: a run on the device brings its environments back exactly")
         with disk_errors(run.path):
-            _train(run, display, resume, inexact)
+            return _train(run, display, resume, inexact)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
             run_directory.discard(run.path, run.made)
@@ -37,16 +37,17 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
         run.held.close()
 
 
-def _train(run: Run, display: Display, resume: bool, inexact: bool) -> None:
+def _train(run: Run, display: Display, resume: bool, inexact: bool) -> bool:
     loaded = None
     if resume:
         if run_directory.is_complete(run.path) and _is_whole(run, display):
             display.say(f"{run.path} is complete; nothing to do")
-            return
+            return False
         loaded = _load(run, display)
         cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
     with Coordinator(run, display, loaded, inexact) as coordinator:
         coordinator.run()
+    return True
 
 
 def _is_whole(run: Run, display: Display) -> bool:
