@@ -93,6 +93,7 @@ def compare(
     out: str | Path = "runs",
     processes: int = 0,
     quiet: bool = False,
+    accept_changed_code: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
     """Does filtering help on `env`? Trains the arms and says what the data support.
@@ -105,6 +106,7 @@ def compare(
       out: the folder of runs and results.
       processes: trainings at a time; 0: one per core.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
       **settings: of every run (`seeds=6`, `steps=1_000_000`).
 
     Returns:
@@ -125,7 +127,14 @@ def compare(
     task = given.pop("env")
     spec = comparison(task, tuple(arms), parse_all(given))
     command = compare_command(task, tuple(arms), given, out)
-    return study(spec, Path(out), command, processes, quiet=quiet)
+    return study(
+        spec,
+        Path(out),
+        command,
+        processes,
+        quiet=quiet,
+        accept_changed_code=accept_changed_code,
+    )
 
 
 def resume(
@@ -134,6 +143,7 @@ def resume(
     quiet: bool = False,
     inexact: bool = False,
     trust: bool = False,
+    accept_changed_code: bool = False,
     **changes: Any,
 ) -> Result:
     """Continues an interrupted run to its end; the result is that of a run left alone.
@@ -143,12 +153,13 @@ def resume(
       quiet: show nothing.
       inexact: start new episodes where environments cannot be brought back.
       trust: the code that the run names may run, even if another user named it.
+      accept_changed_code: go on even if the code that the run names is not what it was.
       **changes: settings that do not touch what is computed (`processes`, ...), and the parts
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
     rest = _provide(Path(path), changes)
-    run = runs.reopen(Path(path), rest, display, trust)
+    run = runs.reopen(Path(path), rest, display, trust, accept_changed_code)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 

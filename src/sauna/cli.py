@@ -20,7 +20,7 @@ from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
 from sauna.system.tracebacks import user_frames
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
-_PLACE = ("out", "processes", "on", "address")  # of a comparison or a study
+_PLACE = ("out", "processes", "on", "address", "accept_changed_code")  # of a comparison or a study
 
 
 class _Parser(argparse.ArgumentParser):
@@ -101,6 +101,10 @@ def make_parser() -> argparse.ArgumentParser:
         command.add_argument("--on", default="local", choices=("local", "ray"), help=text)
         text = "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)"
         command.add_argument("--address", default="", help=text)
+
+    text = "go on with runs whose code (of an environment or plug-in) is not what it was"
+    for command in (resume, compare, study):
+        command.add_argument("--accept-changed-code", action="store_true", help=text)
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, allow_abbrev=False)
@@ -236,9 +240,9 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
 
     path, inexact = Path(values.pop("run")), values.pop("inexact")
-    trust = values.pop("trust")
+    trust, accept = values.pop("trust"), values.pop("accept_changed_code")
     display = make_display()
-    run = runs.reopen(path, values, display, trust)
+    run = runs.reopen(path, values, display, trust, accept)
     train_and_draw(run, display, resume=True, inexact=inexact)
 
 
@@ -303,11 +307,11 @@ def _study(values: dict[str, Any]) -> None:
     _run_study(spec, study_command(name, out), **values)
 
 
-def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
+def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:
     from sauna.experiments.study.command import lines, study
 
     jobs = _whole({"processes": processes}, "processes", 0)
-    summary = study(spec, Path(out), command, jobs, on, address)
+    summary = study(spec, Path(out), command, jobs, **place)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
     if not any(row["seeds"] for row in summary["table"]):

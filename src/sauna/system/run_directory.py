@@ -20,6 +20,7 @@ import os
 import platform
 import subprocess
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -30,8 +31,15 @@ from sauna.system.safe_read import JSON_BYTES, Untrusted, parse_object, read_fil
 from sauna.system.safe_write import is_unfinished, open_grown, replace_file, sync_folder
 
 # What a run's config.json holds that is read again, by its type.
-_PARTS: dict[str, type] = {"config": dict, "given": dict, "spaces": list, "drop_rates": list}
-_NEWER = ("given", "drop_rates")  # that a run of an older version may lack
+_PARTS: dict[str, type] = {
+    "config": dict,
+    "given": dict,
+    "spaces": list,
+    "drop_rates": list,
+    "code": dict,
+    "code_before": list,
+}
+_NEWER = ("given", "drop_rates", "code", "code_before")  # that a run of an older version may lack
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -142,6 +150,17 @@ def read_config(run: Path) -> dict[str, Any]:
             noun = "a table" if kind is dict else "a list"
             raise BadInput(f"config: {path}: {name} is missing or is not {noun}")
     return stored
+
+
+def write_config(run: Path, stored: Mapping[str, Any]) -> None:
+    """Writes `config.json`, atomically."""
+    write_json(run / "config.json", stored)
+
+
+def with_code(stored: Mapping[str, Any], code: Mapping[str, str]) -> dict[str, Any]:
+    """A stored config whose run goes on with other code; what it was before is kept."""
+    before = [*stored.get("code_before", []), stored["code"]] if "code" in stored else []
+    return {**stored, "code": dict(code), "code_before": before}
 
 
 def read_config_file(path: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from sauna.config.code import changed_code, code_of
 from sauna.config.presets import (
     RESUMABLE,
     Member,
@@ -60,6 +61,7 @@ class Run:
         self.spaces, self.differs = found
         self.members: list[Member] = members(config, given)
         self.drop_rates = drop_rates
+        self.code = code_of(to_json(config))
         self.held: IO[str] = run_directory.lock(path)
 
     def manifest(self) -> dict[str, Any]:
@@ -69,6 +71,7 @@ class Run:
             "spaces": list(self.spaces),
             "members": [member.name for member in self.members],
             "versions": run_directory.versions(),
+            "code": self.code,
         }
 
 
@@ -104,7 +107,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
         run = Run(path, given, config, found, drop_rates, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
-            run_directory.write_json(path / "config.json", stored)
+            run_directory.write_config(path, {**stored, "code": run.code})
         except BaseException:
             run.held.close()
             raise
@@ -151,11 +154,18 @@ def follow(given: Mapping[str, Any], display: Display) -> None:
     train_members(job, Follower(display.say))
 
 
-def reopen(path: Path, changes: Mapping[str, Any], display: Display, trust: bool = False) -> Run:
+def reopen(
+    path: Path,
+    changes: Mapping[str, Any],
+    display: Display,
+    trust: bool = False,
+    accept_changed_code: bool = False,
+) -> Run:
     """An existing run, to be continued; from then on it counts as this user's.
 
     Args:
       trust: the code that it names may run, even if another user named it.
+      accept_changed_code: go on with that code even if it is not what it was.
 
     Raises:
       BadInput: it is not a run, is in use, names code of somebody else's, or `changes` would change
@@ -190,9 +200,18 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display, trust: bool
         display.say(f"note: this version has other values; kept from the start: {', '.join(kept)}")
     with disk_errors(path):
         run = Run(path, {**began, **changes}, config, found, stored.get("drop_rates", []))
-        if trust:
-            run_directory.write_json(path / "config.json", {**stored, "seal": seal(stored)})
-        return run
+    changed = changed_code(stored.get("code", run.code), run.code)
+    if changed and not accept_changed_code:
+        run.held.close()
+        raise BadInput(
+            f"{path} was trained with other code: {changed}; --accept-changed-code (in Python "
+            f"accept_changed_code=True) goes on with today's"
+        )
+    with disk_errors(path):
+        if trust or changed:
+            stored = run_directory.with_code(stored, run.code) if changed else stored
+            run_directory.write_config(path, {**stored, "seal": seal(stored)})
+    return run
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.results import gather, typed
+from sauna.experiments.study.same_code import check_same_code
 from sauna.experiments.study.spec import Spec, check, load_spec, read_spec
 from sauna.experiments.study.summary import FILTERING, summarize
 from sauna.experiments.study.units import (
@@ -84,6 +85,7 @@ def study(
     on: str = "local",
     address: str = "",
     quiet: bool = False,
+    accept_changed_code: bool = False,
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
@@ -97,6 +99,7 @@ def study(
       on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
       address: of the cluster.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
 
     Returns:
       the summary.
@@ -117,10 +120,12 @@ def study(
     _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
-        return _train(LocalExecutor, spec, out, command, jobs, command, quiet)
+        return _train(LocalExecutor, spec, out, command, jobs, command, quiet, accept_changed_code)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with ray_cluster.connected(address, jobs) as jobs:
-        return _train(ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet)
+        return _train(
+            ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet, accept_changed_code
+        )
 
 
 def _check_runs(spec: Spec) -> None:
@@ -175,6 +180,7 @@ def _train(
     jobs: int,
     again: str,
     quiet: bool,
+    accept_changed_code: bool,
 ) -> dict[str, Any]:
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
@@ -182,6 +188,7 @@ def _train(
     with _held(folder):
         _note(spec, place, size)
         units = units_of(spec, size)
+        check_same_code(units, folder, accept_changed_code)
         view = StudyView(spec, units, folder, quiet)
         members = sum(len(unit.seeds) for unit in units)
         view.say(
