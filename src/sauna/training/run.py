@@ -26,6 +26,7 @@ from sauna.config.presets import (
 from sauna.config.settings import Config, local_parts, to_json
 from sauna.config.trust import check_trusted, seal
 from sauna.envs.probe import Probe
+from sauna.envs.spaces import difference, read_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
@@ -188,11 +189,12 @@ def reopen(
     _check_placement(config, changes)
     found = look_at(config)
     config = settle(config, found.spaces)
-    if stored["spaces"] != json.loads(json.dumps(found.spaces)):
-        raise BadInput(
-            f"{config.env} has other spaces than when the run started: "
-            f"{found.spaces} instead of {stored['spaces']}"
-        )
+    try:
+        differs = difference(found.spaces, read_spaces(stored["spaces"]))
+    except (TypeError, ValueError) as error:
+        raise BadInput(f"config: {path}: its spaces cannot be read: {error}") from error
+    if differs:
+        raise BadInput(f"{config.env} has other spaces than when the run started: {differs}")
     before = stored.get("given", {})
     began = as_began(stored["config"], before)
     kept = [f"{name} {value}" for name, value in began.items() if before.get(name) != value]

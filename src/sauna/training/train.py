@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import RESUMABLE
 from sauna.config.settings import Config, to_json
+from sauna.envs.spaces import difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import check_logs, cut_logs, damage_of
@@ -98,9 +98,14 @@ def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> No
         for name, value in own["config"].items()
         if name not in (*RESUMABLE, "out") and stored[name] != value
     ]
-    for name in ("spaces", "members"):
-        if manifest[name] != json.loads(json.dumps(own[name])):
-            differing.append(f"{name} differ")
+    try:
+        spaces = difference(read_spaces(manifest["spaces"]), read_spaces(own["spaces"]))
+    except (TypeError, ValueError):
+        spaces = "cannot be read"
+    if spaces:
+        differing.append(f"spaces differ: {spaces}")
+    if manifest["members"] != own["members"]:
+        differing.append("members differ")
     if differing:
         raise BadInput(
             f"{path}: its checkpoint is of another run or environment: {'; '.join(differing)}"

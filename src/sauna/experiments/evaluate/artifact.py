@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from sauna.config.presets import stored_config
 from sauna.config.settings import Config
 from sauna.config.trust import check_trusted
-from sauna.envs.spaces import Spaces, describe, read_spaces
+from sauna.envs.spaces import Spaces, describe, difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
 
@@ -70,8 +70,5 @@ def check_spaces(artifact: Artifact, env: Any) -> None:
       BadInput: naming the space that differs.
     """
     found = describe(env.observation_space, env.action_space)
-    for part in ("observation_text", "action_text"):
-        ours, theirs = getattr(artifact.spaces, part), getattr(found, part)
-        if ours != theirs:
-            kind = part.split("_")[0]
-            raise BadInput(f"env: the run's {kind} space is {ours}, this environment's {theirs}")
+    if differs := difference(artifact.spaces, found):
+        raise BadInput(f"env: has other spaces than the run: {differs}")
