@@ -17,12 +17,13 @@ import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.policy.normalize import (
-    Moments,
+    LongMoments,
     initial_moments,
-    moments_after_each,
+    long_moments,
+    long_moments_after_all,
     normalize,
     scale_rewards,
-    update_moments,
+    update_long_moments,
 )
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import capacity
@@ -38,8 +39,8 @@ class CollectState(NamedTuple):
     """What one member carries from one rollout to the next."""
 
     envs: Running  # [N, ...]
-    observation_moments: Moments | tuple[()]  # of [D] float32; () where nothing is normalised
-    reward_moments: Moments  # of [1] float32
+    observation_moments: LongMoments | tuple[()]  # of [D]; () where nothing is normalised
+    reward_moments: LongMoments  # of [1]
     discounted_return: Array  # [N] float32
     episode_return: Array  # [N] float32, raw rewards so far
     episode_length: Array  # [N] int32
@@ -108,16 +109,15 @@ def start(parts: Collecting, key: Array) -> CollectState:
     envs = begin(parts.env, key, config.envs, cached=config.reset == "cached")
     moments: Any = ()
     if config.normalize_observations:
-        moments = _float32(initial_moments((), envs.observation.shape[-1]))
-        moments = update_moments(moments, envs.observation, jnp.ones(config.envs, bool))
+        moments = _first_moments(envs.observation.shape[-1])
+        moments = update_long_moments(moments, envs.observation, jnp.ones(config.envs, bool))
     zeros = jnp.zeros(config.envs, jnp.float32)
-    return CollectState(
-        envs, moments, _float32(initial_moments((), 1)), zeros, zeros, zeros.astype(jnp.int32)
-    )
+    return CollectState(envs, moments, _first_moments(1), zeros, zeros, zeros.astype(jnp.int32))
 
 
-def _float32(moments: Moments) -> Moments:
-    return Moments(*(jnp.asarray(part, jnp.float32) for part in moments))
+def _first_moments(size: int) -> LongMoments:
+    parts = long_moments(initial_moments((), size))
+    return LongMoments(*(jnp.asarray(part, jnp.float32) for part in parts))
 
 
 def collect(
@@ -190,10 +190,10 @@ def _noise(parts: Collecting, key: Array, iteration: Array) -> Array:
     return noise.reshape((-1, *noise.shape[2:]))
 
 
-def _seen(parts: Collecting, moments: Moments | tuple[()], raw: Array) -> Array:
+def _seen(parts: Collecting, moments: LongMoments | tuple[()], raw: Array) -> Array:
     """What the policy sees of raw observations `[N, *obs]`."""
-    if isinstance(moments, Moments):
-        return normalize(moments, raw, parts.config.clip_observations)
+    if isinstance(moments, LongMoments):
+        return normalize(moments.moments, raw, parts.config.clip_observations)
     return raw
 
 
@@ -220,8 +220,8 @@ def _step(
         keep = decided & acting
     envs, told = advance(parts.env, state.envs, action, acting, env_key, parts.anywhere)
     moments = state.observation_moments
-    if isinstance(moments, Moments):
-        moments = update_moments(moments, envs.observation, acting)
+    if isinstance(moments, LongMoments):
+        moments = update_long_moments(moments, envs.observation, acting)
     reward = jnp.where(acting, told.reward, 0.0)
     ended = told.terminated | told.truncated
     episode_return = state.episode_return + reward
@@ -256,7 +256,7 @@ def _finite_rows(*arrays: Array) -> Array:
 
 
 def _final_values(
-    parts: Collecting, params: Array, moments: Moments | tuple[()], told: Transition
+    parts: Collecting, params: Array, moments: LongMoments | tuple[()], told: Transition
 ) -> Array:
     """V `[N]` of what truncated episodes had reached; 0 elsewhere, and computed only for some."""
     if parts.config.truncation != "bootstrap":
@@ -322,9 +322,9 @@ def _scaled_rewards(
 
     ended = rows.terminated | rows.truncated
     last, sums = jax.lax.scan(step, state.discounted_return, (rows.reward, ended, rows.valid))
-    own = Moments(*(part[0] for part in state.reward_moments))
-    after = moments_after_each(own, sums, rows.valid)
-    moments = Moments(*(part[-1:] for part in after))
+    own = LongMoments(*(part[0] for part in state.reward_moments))
+    after, end = long_moments_after_all(own, sums, rows.valid)
+    moments = LongMoments(*(part[None] for part in end))
     reward = scale_rewards(after, rows.reward, config.clip_rewards)
     return reward, state._replace(reward_moments=moments, discounted_return=last)
 
