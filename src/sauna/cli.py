@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from sauna import __version__
 from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
 from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
-from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest
+from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest, printable
 from sauna.system.tracebacks import user_frames
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
@@ -171,7 +171,7 @@ def _fail(message: object, code: int) -> NoReturn:
     """Ends with one line, below the frames of the user's own code if that raised."""
     if isinstance(message, SaunaError) and (frames := user_frames(message)):
         print(frames, file=sys.stderr)
-    print(f"sauna: {message}", file=sys.stderr)
+    print(f"sauna: {printable(str(message))}", file=sys.stderr)
     sys.exit(code)
 
 
@@ -283,7 +283,7 @@ def _inspect(values: dict[str, Any]) -> None:
 
 
 def _whole(values: dict[str, Any], name: str, least: int) -> int:
-    if not values[name].isdigit() or int(values[name]) < least:
+    if not values[name].isdecimal() or int(values[name]) < least:
         raise BadInput(f"{name}: must be a whole number of at least {least}")
     return int(values[name])
 
@@ -372,7 +372,7 @@ def _bench(values: dict[str, Any]) -> None:
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
+    print(printable(text), flush=True)
 
 
 def _list(values: dict[str, Any]) -> None:

@@ -39,7 +39,6 @@ _PARTS: dict[str, type] = {
     "code": dict,
     "code_before": list,
 }
-_NEWER = ("given", "drop_rates", "code", "code_before")  # that a run of an older version may lack
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -134,8 +133,8 @@ def write_json(path: Path, value: Any) -> None:
     replace_file(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_config(run: Path) -> dict[str, Any]:
-    """`config.json` of a run: `config` and what else a run has, each of its type.
+def read_config(run: Path, needed: tuple[str, ...] = ("config", "spaces")) -> dict[str, Any]:
+    """`config.json` of a run: what is `needed` is there, and what is there is of its type.
 
     Raises:
       BadInput: there is no run, or its config is not one.
@@ -145,7 +144,7 @@ def read_config(run: Path) -> dict[str, Any]:
         raise BadInput(f"{run} is not a run directory (it has no config.json)")
     stored = _read(path)
     for name, kind in _PARTS.items():
-        missing = kind() if name in _NEWER else None
+        missing = None if name in needed else kind()
         if type(stored.get(name, missing)) is not kind:
             noun = "a table" if kind is dict else "a list"
             raise BadInput(f"config: {path}: {name} is missing or is not {noun}")

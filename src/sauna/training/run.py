@@ -30,6 +30,7 @@ from sauna.envs.spaces import difference, read_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
+from sauna.system.working_folder import kept_folder
 from sauna.training.display import Display
 from sauna.training.loop.multihost import Follower, join, read_place
 from sauna.training.prepare import (
@@ -76,12 +77,14 @@ class Run:
         }
 
 
+@kept_folder()
 def start(given: Mapping[str, Any], display: Display) -> Run:
     """A new run: everything is checked before anything is created.
 
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
     """
+    here = Path.cwd()  # an environment may go elsewhere
     given = plain(given)
     config = placed(resolve(given))
     check_writes(config)
@@ -90,7 +93,7 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
     TensorBoard.check(config)
     check_own_parts(config, found.spaces)
     path = Path(config.out) if config.out else run_directory.default_path(config.env, config.arm)
-    config = dataclasses.replace(config, out=str(path))
+    config, path = dataclasses.replace(config, out=str(path)), here / path
     stored = {
         "given": given,
         "config": to_json(config),
@@ -155,6 +158,7 @@ def follow(given: Mapping[str, Any], display: Display) -> None:
     train_members(job, Follower(display.say))
 
 
+@kept_folder()
 def reopen(
     path: Path,
     changes: Mapping[str, Any],
@@ -172,6 +176,7 @@ def reopen(
       BadInput: it is not a run, is in use, names code of somebody else's, or `changes` would change
         what is computed.
     """
+    path = Path.cwd() / path  # an environment may go elsewhere
     stored = run_directory.read_config(path)
     check_trusted(stored, str(path), stored.get("seal"), trust)
     for name in changes:

@@ -32,6 +32,7 @@ from sauna.algorithm.types import Array, Filter, Hypers, Keys, Rollout
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv, Running, Transition, advance, begin
 
+LARGEST = 1e18  # of an observation or a reward: its square is finite in float32
 WINDOW = 100  # finished episodes of one iteration that are reported one by one, the latest
 
 
@@ -252,7 +253,9 @@ def _step(
 
 
 def _finite_rows(*arrays: Array) -> Array:
-    return jnp.all(jnp.stack([jnp.isfinite(x.reshape(len(x), -1)).all(1) for x in arrays]), 0)
+    """Whether the numbers of each row are finite, and small enough to be squared in float32."""
+    fine = [(jnp.abs(x.reshape(len(x), -1)) <= LARGEST).all(1) for x in arrays]
+    return jnp.all(jnp.stack(fine), 0)
 
 
 def _final_values(
@@ -358,5 +361,5 @@ def _faults(rows: _Row, begun: Array) -> Faults:
     bad = bad.at[0].set(jnp.where(early, ~begun, bad[0]))
     place = jnp.argmax(bad)
     row, env = jnp.unravel_index(place, bad.shape)
-    in_reward = ~jnp.isfinite(rows.reward[row, env]) & ~early
+    in_reward = ~(jnp.abs(rows.reward[row, env]) <= LARGEST) & ~early
     return Faults(jnp.any(bad), row.astype(jnp.int32), env.astype(jnp.int32), in_reward)

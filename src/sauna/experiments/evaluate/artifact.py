@@ -12,6 +12,7 @@ from sauna.config.trust import check_trusted
 from sauna.envs.spaces import Spaces, describe, difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
+from sauna.system.logs import check_logs
 
 
 class Artifact(NamedTuple):
@@ -36,9 +37,9 @@ def load_artifact(
         `trust` allows.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
-    stored = run_directory.read_config(run)
+    stored = run_directory.read_config(run, needed=())
     if iteration is None:
-        loaded = checkpoint.load_newest(run / "checkpoints", warn)
+        loaded = _newest(run, warn)
     else:
         loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     if loaded is None:
@@ -52,8 +53,24 @@ def load_artifact(
     return Artifact(config, spaces, loaded.manifest["members"], loaded)
 
 
+def _newest(run: Path, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
+    """The newest checkpoint that is good and whose rows are all there; else, the newest good one.
+
+    Raises:
+      BadCheckpoint: there are checkpoints, but none is good.
+    """
+    try:
+        return checkpoint.load_newest(
+            run / "checkpoints", warn, lambda manifest: check_logs(run, manifest)
+        )
+    except checkpoint.BadCheckpoint:
+        loaded = checkpoint.load_newest(run / "checkpoints", lambda text: None)
+        warn("warning: no checkpoint has all its rows; the newest one is used")
+        return loaded
+
+
 def find_member(members: list[str], member: str | int) -> str:
-    if isinstance(member, int) or member.isdigit():
+    if isinstance(member, int) or member.isdecimal():
         index = int(member)
         if not 0 <= index < len(members):
             raise BadInput(f"member: {index} is not between 0 and {len(members) - 1}")

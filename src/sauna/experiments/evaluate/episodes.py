@@ -17,11 +17,13 @@ from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_mem
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.safe_write import own_folder, replacing
+from sauna.system.working_folder import kept_folder
 
 if TYPE_CHECKING:
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
 
+@kept_folder()
 def evaluate(
     run: str | Path,
     *,
@@ -56,7 +58,7 @@ def evaluate(
       BadInput: no such run or member, impossible numbers, or `env` has other spaces.
       SaunaError: a video was asked for and the environment cannot render here.
     """
-    run = Path(run)
+    run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0:
         raise BadInput("episodes: must be at least 1, and seed at least 0")
     artifact = load_artifact(run, say, trust=trust)

@@ -8,8 +8,10 @@ from pathlib import Path
 from sauna.experiments.evaluate.artifact import find_member, load_artifact
 from sauna.system.errors import BadInput
 from sauna.system.safe_write import replace_file
+from sauna.system.working_folder import kept_folder
 
 
+@kept_folder()
 def inspect(
     run: str | Path,
     *,
@@ -40,13 +42,13 @@ def inspect(
     Raises:
       BadInput: no such run or member, impossible numbers, or a page that cannot be put there.
     """
-    run = Path(run)
+    run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0:
         raise BadInput("episodes: must be at least 1, and seed at least 0")
     artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"
-    path = Path(out) if out else run / f"inspect_{name.replace('/', '-')}_{mode}.html"
+    path = Path.cwd() / out if out else run / f"inspect_{name.replace('/', '-')}_{mode}.html"
     if path.is_dir() or not path.parent.is_dir():
         raise BadInput(f"out: {path} is a folder, or not in one")
     from sauna.experiments.inspect.inspection import examine  # imports JAX, so after the checks

@@ -21,6 +21,7 @@ from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
 from sauna.experiments.inspect.recording import Played, clock, open_world, play_episodes, play_steps
 from sauna.system import run_directory
+from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under
 
@@ -62,7 +63,9 @@ def examine(
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
     everyone = members(artifact.config, as_began(manifest["config"], manifest["given"]))
-    member = next(one for one in everyone if one.name == name)
+    member = next((one for one in everyone if one.name == name), None)
+    if member is None:
+        raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
     config, iteration = member.config, int(manifest["iteration"])
     kwargs = json.loads(config.env_kwargs)
     world, drawer = open_world(config.env, kwargs, pictures, say)

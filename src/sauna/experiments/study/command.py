@@ -20,9 +20,9 @@ from sauna.experiments.report.numbers import digits_of_tasks, interval, number
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
+from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.results import gather, typed
-from sauna.experiments.study.same_code import check_same_code
 from sauna.experiments.study.spec import Spec, check, load_spec, read_spec
 from sauna.experiments.study.summary import FILTERING, summarize
 from sauna.experiments.study.units import (
@@ -36,6 +36,7 @@ from sauna.experiments.study.units import (
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
+from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import check_read_after_settling, look_at, placed, settle
 
 SEEDS = 6  # of a comparison, where none are given
@@ -117,7 +118,9 @@ def study(
         ray_cluster.check(address)
     elif address:
         raise BadInput("address: read with --on ray only")
-    _check_runs(spec)
+    out = Path.cwd() / out  # an environment may go elsewhere
+    with kept_folder():
+        _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
         return _train(LocalExecutor, spec, out, command, jobs, command, quiet, accept_changed_code)
@@ -190,6 +193,7 @@ def _train(
         units = units_of(spec, size)
         check_same_code(units, folder, accept_changed_code)
         view = StudyView(spec, units, folder, quiet)
+        reopen_damaged(units, folder, view.say)
         members = sum(len(unit.seeds) for unit in units)
         view.say(
             f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "

@@ -19,6 +19,7 @@ import numpy as np
 from sauna.algorithm.policy.normalize import LongMoments, Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import Collected, Episode
+from sauna.algorithm.rollout.device import LARGEST
 from sauna.algorithm.types import Hypers, TrainState, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config, to_json
@@ -182,7 +183,7 @@ def _check_sound(member: Member, iteration: int, report: Report) -> None:
         what = "reward" if report.faults.in_reward else "observation"
         raise EnvironmentFailure(
             f"environment {report.faults.env} of {member.name}, iteration {iteration}, step "
-            f"{report.faults.row} of the rollout: {what} is not finite"
+            f"{report.faults.row} of the rollout: {what} is not finite or beyond {LARGEST:g}"
         )
     check_finite(member, iteration, report.learned)
 

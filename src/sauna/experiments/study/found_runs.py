@@ -1,13 +1,15 @@
-"""Whether the units of a study were trained with the code that their settings name today."""
+"""The runs that a study finds: of the code that it names today, and with all their rows."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from sauna.config.code import changed_code, code_of
 from sauna.experiments.study.units import Unit, parts
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
+from sauna.system.logs import damage_of
 
 
 def check_same_code(units: list[Unit], folder: Path, accept: bool) -> None:
@@ -33,3 +35,12 @@ def check_same_code(units: list[Unit], folder: Path, accept: bool) -> None:
             )
         if changed:
             run_directory.write_config(run, run_directory.with_code(stored, now))
+
+
+def reopen_damaged(units: list[Unit], folder: Path, say: Callable[[str], None]) -> None:
+    """Lets complete runs whose rows are not what was written be continued from before that."""
+    for unit in (part for whole in units for part in parts(whole, folder)):
+        run = unit.run(folder)
+        if unit.is_complete(folder) and (damage := damage_of(run)):
+            say(f"warning: {damage}; the run is continued from before that")
+            (run / "summary.json").unlink()
