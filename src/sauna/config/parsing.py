@@ -64,6 +64,8 @@ def _seeds(value: Any) -> tuple[int, ...]:
         if number > MOST_SEEDS:
             raise BadInput(f"seeds: {number} is too many; for the seed {number} write {number},")
         return tuple(range(number))
+    if len(value) > MOST_SEEDS:
+        raise BadInput(f"seeds: {len(value)} are too many; at most {MOST_SEEDS}")
     return tuple(_integer(seed) for seed in value)
 
 

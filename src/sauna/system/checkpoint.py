@@ -137,7 +137,13 @@ def _free_name(path: Path) -> Path:
 
 
 def numbered(folder: Path) -> list[Path]:
-    """The finished checkpoints of a run, oldest first."""
+    """The finished checkpoints of a run, oldest first.
+
+    Raises:
+      BadCheckpoint: their folder is a link, or something else.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise BadCheckpoint(f"{folder} is not a folder (nothing is read through links)")
     found = folder.glob("[0-9]" * 8)
     return sorted(path for path in found if path.is_dir() and not path.is_symlink())
 

@@ -47,6 +47,8 @@ def open_file(path: Path) -> IO[bytes]:
       Untrusted: there is no such file, or it is a link or something else.
     """
     try:
+        if not stat.S_ISREG(os.lstat(path).st_mode):  # opening a device may do something
+            raise Untrusted(f"{path.name} is not a regular file")
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         why = getattr(error, "strerror", None) or error

@@ -17,13 +17,14 @@ from sauna.config.code import changed_code, code_of
 from sauna.config.presets import (
     RESUMABLE,
     Member,
+    _check_arms,
     as_began,
     members,
     plain,
     resolve,
     stored_config,
 )
-from sauna.config.settings import Config, local_parts, to_json
+from sauna.config.settings import Config, check_consistent, local_parts, to_json
 from sauna.config.trust import check_trusted, seal
 from sauna.envs.probe import Probe
 from sauna.envs.spaces import difference, read_spaces
@@ -186,6 +187,8 @@ def reopen(
     resolved = resolve(given)
     config = stored_config(stored.get("config", {}))
     config = dataclasses.replace(config, **{name: getattr(resolved, name) for name in changes})
+    _check_arms(config.arm, {})
+    check_consistent(config)
     TensorBoard.check(config)
     config = placed(config)
     check_writes(config)
