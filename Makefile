@@ -1,66 +1,108 @@
+# make setup  install into .venv what development needs
 # make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
 # make test   install into .venv, run the tests
+# make test-faults  a few tries of every fault of docs/concepts/reliability.md
+# make test-newest  both with the newest versions of all packages, in .venv-newest
 # make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
-# make campaign  every fault of docs/reliability.md in full (hours; continues where it stopped)
+# make campaign  every fault of docs/concepts/reliability.md in full (hours; continues where it stopped)
 # make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
 # make cost   what checks and checkpoints take of a training
+# make docs   build the documentation site into site/; a broken link is an error
 # make lint   style, format and types
+# make constraints  resolve all packages anew and write constraints.txt, which all of the above install from
 # make results  train what results/ holds (hours; continues where it stopped), remake tables and figures
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
-BIN := .venv/bin
+VENV := .venv
+VERSIONS := -c constraints.txt
+BIN := $(VENV)/bin
+INSTALL = $(BIN)/pip --disable-pip-version-check install $(VERSIONS) -e
+USE = @echo "To use sauna in this shell: source $(VENV)/bin/activate"
 
-.PHONY: setup demo test test-slow campaign mutants soak cost lint results clean
+.PHONY: setup setup-ci demo test test-faults test-newest test-slow campaign mutants soak cost docs lint constraints results clean
 
-.venv/bin/python:
+$(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed (set PYTHON=...)"; exit 1; }
-	$(PYTHON) -m venv .venv
+	$(PYTHON) -m venv $(VENV)
 
-.venv/.run: .venv/bin/python pyproject.toml
-	$(BIN)/pip install --quiet -e .
+$(VENV)/.run: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) .
 	@touch $@
 
-.venv/.dev: .venv/bin/python pyproject.toml
-	$(BIN)/pip install --quiet -e '.[dev]'
-	@touch $@ .venv/.run
+$(VENV)/.dev: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) '.[dev]'
+	@touch $@ $(VENV)/.run
 
-.venv/.slow: .venv/bin/python pyproject.toml
-	$(BIN)/pip install --quiet -e '.[dev,cluster,brax,playground]'
-	@touch $@ .venv/.dev .venv/.run
+$(VENV)/.ci: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) '.[dev,cluster]'
+	@touch $@ $(VENV)/.dev $(VENV)/.run
 
-setup: .venv/.dev
+$(VENV)/.slow: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) '.[dev,docs,cluster,brax,playground]'
+	@touch $@ $(VENV)/.ci $(VENV)/.dev $(VENV)/.docs $(VENV)/.run
 
-demo: .venv/.run
+$(VENV)/.docs: $(BIN)/python pyproject.toml constraints.txt
+	$(INSTALL) '.[docs]'
+	@touch $@ $(VENV)/.run
+
+setup: $(VENV)/.dev
+	$(USE)
+
+setup-ci: $(VENV)/.ci
+
+demo: $(VENV)/.run
 	$(BIN)/sauna train InvertedPendulum-v5 --arm sauna --seeds 3 --steps 100000
+	$(USE)
 
 # Half of the time of a first run is compiling: here without LLVM's optimisations.
-test: .venv/.dev
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
+PYTEST = JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
 
-test-slow: .venv/.slow
+test: $(VENV)/.dev
+	$(PYTEST) -m 'not slow and not campaign'
+
+test-faults: $(VENV)/.dev
+	$(PYTEST) -m 'not slow and campaign'
+
+test-newest:
+	rm -rf .venv-newest
+	$(MAKE) setup-ci test test-faults VENV=.venv-newest VERSIONS=
+
+test-slow: $(VENV)/.slow
 	$(BIN)/python -m pytest -m slow
 
-campaign: .venv/.dev
+campaign: $(VENV)/.dev
 	$(BIN)/python tests/faults/campaign.py
 
-mutants: .venv/.dev
+mutants: $(VENV)/.dev
 	$(BIN)/python tests/faults/mutants.py
 
-soak: .venv/.dev
+soak: $(VENV)/.dev
 	$(BIN)/python tests/faults/soak.py
 
-cost: .venv/.dev
+cost: $(VENV)/.dev
 	$(BIN)/python tests/faults/cost.py
 
-lint: .venv/.dev
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict
+
+lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-results: .venv/.dev
+# One file for every Python and system: uv writes both versions where they differ, with markers.
+constraints:
+	$(PYTHON) -m venv .venv-uv
+	.venv-uv/bin/pip --disable-pip-version-check install --upgrade uv
+	echo '# Made by `make constraints`: exact versions of what the package and its extras need.' > .venv-uv/new
+	.venv-uv/bin/uv pip compile pyproject.toml --all-extras --universal --python-version 3.11 \
+		--no-annotate --no-header --quiet >> .venv-uv/new
+	mv .venv-uv/new constraints.txt
+
+results: $(VENV)/.dev
 	$(BIN)/python results/make.py --train
 
 clean:
-	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-newest .venv-uv .pytest_cache .mypy_cache .ruff_cache

@@ -1,9 +1,9 @@
 """This project's HumanoidFlagrunHarder beside the Bullet port's: what they show, pay and end.
 
-python benchmarks/flagrun_ports.py            the tables of docs/flagrun.md from the result file
+python benchmarks/flagrun_ports.py            the tables of the page from the result file
 python benchmarks/flagrun_ports.py --measure  measures first (a quarter of an hour), which needs
                                               `pip install pybullet-envs-gymnasium`
-python benchmarks/flagrun_ports.py --stills   draws the pictures of docs/flagrun.md
+python benchmarks/flagrun_ports.py --stills   draws the pictures of docs/reference/flagrun.md
 """
 
 from __future__ import annotations
@@ -203,12 +203,12 @@ def stills() -> None:
 
     env = make_env(ENVS["here"], {}, render_mode="rgb_array").unwrapped
     env.reset(seed=0)
-    imageio.imwrite(ROOT / "docs" / "flagrun" / "start.png", env.render())
+    imageio.imwrite(ROOT / "docs" / "images" / "flagrun" / "start.png", env.render())
     env.reset(seed=THROWN_FROM_AHEAD)
     env.task = env.task._replace(frame=np.int32(120))
     for _ in range(6):
         env.step(np.zeros(17))
-    imageio.imwrite(ROOT / "docs" / "flagrun" / "cube.png", env.render())
+    imageio.imwrite(ROOT / "docs" / "images" / "flagrun" / "cube.png", env.render())
     env.close()
 
 
@@ -218,7 +218,7 @@ def main() -> None:
         measure()
     if "--stills" in sys.argv:
         stills()
-    result, page = json.loads(RESULT.read_text()), ROOT / "docs" / "flagrun.md"
+    result, page = json.loads(RESULT.read_text()), ROOT / "docs" / "reference" / "flagrun.md"
     insert(page, "episodes", episodes_table(result))
     insert(page, "observations", observations_table(result))
     insert(page, "training", training_table(result))

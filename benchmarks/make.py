@@ -109,6 +109,25 @@ def rates_table(found: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def short_table(found: dict[str, dict[str, Any]]) -> str:
+    """The README's table: what was trained, how fast, and beside what."""
+    lines = [
+        "| PPO on | seeds, processes | env steps/s | of the simulator alone | against |",
+        "|---|---|---|---|---|",
+    ]
+    for one in found.values():
+        rates = sorted(one["rates"]["training"])
+        peer = "-"
+        if "peer" in one:
+            name = one["peer"]["name"]
+            peer = f"{one['ratios'][name]['median']:.1f} x {NAMES[name]}"
+        lines.append(
+            f"| {one['env']} | {one['members']}, {one['processes']} | "
+            f"{rates[len(rates) // 2]:,.0f} | {one['ratios']['physics']['median']:.0%} | {peer} |"
+        )
+    return "\n".join(lines)
+
+
 def _peer(one: dict[str, Any]) -> str:
     if "peer" not in one:
         return "-"
@@ -158,8 +177,8 @@ def main() -> None:
     if "--measure" in sys.argv:
         measure()
     found = stored()
-    insert(ROOT / "README.md", "speed", rates_table(found))
-    page = ROOT / "docs" / "performance.md"
+    insert(ROOT / "README.md", "speed", short_table(found))
+    page = ROOT / "docs" / "concepts" / "performance.md"
     machine = next(iter(found.values()))["machine"]
     text = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
     insert(page, "machine", f"Measured on: {text}.")
@@ -172,7 +191,11 @@ def main() -> None:
     if scaled.exists():
         result = json.loads(scaled.read_text())
         insert(page, "scale", scale_table(result))
-        draw(result["scale"], f"{result['env']}, PPO, whole training", ROOT / "docs" / "scale.png")
+        draw(
+            result["scale"],
+            f"{result['env']}, PPO, whole training",
+            ROOT / "docs" / "images" / "scale.png",
+        )
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from sauna.algorithm.rollout.program import Program, make_program
-from sauna.config.presets import members, resolve
+from sauna.config.presets import resolve
 from sauna.config.settings import Config
 from sauna.envs.host.contract import Step
 from sauna.training.loop.job import Job
 from sauna.training.loop.member_state import flat_params
-from sauna.training.prepare import look_at, placed, settle
+from sauna.training.prepare import prepare
 from sauna.training.worker import train_members
 
 SMALL = {
@@ -64,18 +63,12 @@ class Recorder:
 
 
 def make_job(env: str, chosen: list[int] | None = None, **settings: Any) -> Job:
-    given = {"env": env, "processes": 1, **SMALL, **settings}
+    overrides = {"env": env, "arm": "sauna", "processes": 1, **SMALL, **settings}
     if "network" in settings:
-        del given["hidden"]  # which only the MLP reads
+        del overrides["hidden"]  # which only the MLP reads
     if settings.get("algorithm") == "a2c":
-        del given["minibatches"], given["epochs"]  # which only PPO reads
-    config = placed(resolve(given))
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    everyone = members(config, given)
-    picked = everyone if chosen is None else [everyone[i] for i in chosen]
-    kwargs = json.loads(config.env_kwargs)
-    return Job(config, found.spaces, kwargs, picked, [], None, 0, found.differs is None)
+        del overrides["minibatches"], overrides["epochs"]  # which only PPO reads
+    return prepare(overrides).job(chosen)
 
 
 def train_here(job: Job, stop: int | None = None) -> Recorder:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sauna import Filter, JaxEnv, Transition, VexTarget
+from sauna import JaxEnv, StepFilter, Transition, VexTarget
 from sauna.algorithm.types import member_keys
 
 LENGTH = 12
@@ -166,13 +166,15 @@ def no_env(**kwargs: Any) -> int:
 
 
 # Parts of a user's own with the mistakes that users make.
-misspelt = Filter(lambda n, room: (), lambda s, o, vex, k, hypers: (s, vex > hypers.treshold))
-too_long = Filter(lambda n, room: (), lambda s, o, vex, k, h: (s, jnp.append(vex, 0.0) > 0))
-forgetting = Filter(lambda n, room: jnp.zeros(n), lambda s, o, vex, k, h: (s.sum(), vex > 0))
+misspelt = StepFilter(lambda n, room: (), lambda s, step, k, h: (s, step.vex > h.treshold))
+too_long = StepFilter(lambda n, room: (), lambda s, step, k, h: (s, jnp.append(step.vex, 0.0) > 0))
+forgetting = StepFilter(lambda n, room: jnp.zeros(n), lambda s, step, k, h: (s.sum(), step.vex > 0))
 # And without: Python numbers as a state, and numpy where nothing is traced.
-smoothed = Filter(lambda n, room: 0, lambda s, o, vex, k, h: (0.9 * s + vex.mean(), vex >= s))
-by_numpy = Filter(
+smoothed = StepFilter(
+    lambda n, room: 0, lambda s, step, k, h: (0.9 * s + step.vex.mean(), step.vex >= s)
+)
+by_numpy = StepFilter(
     lambda n, room: jnp.asarray(np.asarray(jnp.zeros(n))),
-    lambda s, o, vex, k, h: (s + vex, vex >= s),
+    lambda s, step, k, h: (s + step.vex, step.vex >= s),
 )
 summed = VexTarget(lambda return_, value, weight, episode: jnp.sum(return_ - value))

@@ -29,7 +29,11 @@ ROOT = Path(__file__).parent.parent
 def result(tmp_path_factory):
     run = tmp_path_factory.mktemp("api") / "run"
     return sauna.train(
-        "worlds:Scripted", quiet=True, out=run, tensorboard=True, **{**SMALL, "seeds": 2}
+        "worlds:Scripted",
+        quiet=True,
+        out=run,
+        tensorboard=True,
+        **{**SMALL, "arm": "sauna", "seeds": 2},
     )
 
 
@@ -176,15 +180,15 @@ def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_pa
         out=tmp_path / "run",
         env_processes=2,
         processes=1,
-        **{**SMALL, "seeds": 2},
+        **{**SMALL, "arm": "sauna", "seeds": 2},
     )
     assert other.metrics == result.metrics
 
 
 def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
-    """The code block of docs/plugins.md, as it stands there, from the command line."""
-    text = (ROOT / "docs" / "plugins.md").read_text()
-    code = text.split("```python\n")[1].split("```")[0]
+    """The file of docs/how-to/own_selection_rule.md, as it stands there, from the command line."""
+    text = (ROOT / "docs" / "how-to" / "own_selection_rule.md").read_text()
+    code = text.split('```python title="my_filters.py"\n')[1].split("```")[0]
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
     (tmp_path / "my_filters.py").write_text(code)
     command = next(line for line in text.splitlines() if line.startswith("sauna train"))
@@ -217,11 +221,17 @@ def test_filters_of_ones_own_may_be_plain(name: str, tmp_path) -> None:
 
 
 def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
-    text = (ROOT / "docs" / "plugins.md").read_text()
-    (tmp_path / "my_targets.py").write_text(text.split("```python\n")[2].split("```")[0])
+    text = (ROOT / "docs" / "how-to" / "own_vex_target.md").read_text()
+    code = text.split('```python title="my_targets.py"\n')[1].split("```")[0]
+    (tmp_path / "my_targets.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     run = sauna.train(
-        "worlds:Scripted", quiet=True, out=tmp_path / "run", vex_target="my_targets:sign", **SMALL
+        "worlds:Scripted",
+        quiet=True,
+        out=tmp_path / "run",
+        arm="vex-head",
+        vex_target="my_targets:sign",
+        **SMALL,
     )
     assert all(0 <= row["vex_target"] <= 1 for row in run.metrics)
 
@@ -265,7 +275,7 @@ def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
     shown = display.make_display()
     assert isinstance(shown, display.LiveDisplay)
     sauna_run = sauna.api.runs.start(
-        {"env": "worlds:Finite", "out": str(tmp_path / "run"), **SMALL}, shown
+        {"env": "worlds:Finite", "arm": "sauna", "out": str(tmp_path / "run"), **SMALL}, shown
     )
     sauna.api.train_and_draw(sauna_run, shown, resume=False)
     text = capsys.readouterr().out

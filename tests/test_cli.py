@@ -11,8 +11,12 @@ import pytest
 
 from command_line import sauna, small_flags
 from sauna import cli
-from sauna.config.presets import ARMS, PRESETS, given_by, members, resolve, stored_config
+from sauna.config.accepted import translate
+from sauna.config.other_names import ACCEPTED, ADVICE, SAME
+from sauna.config.parsing import many_seeds
+from sauna.config.presets import ARMS, PRESETS, overrides_of, resolve, resolve_run
 from sauna.config.settings import FIELDS, flag, parse, to_json
+from sauna.config.stored import read_stored, stored_config, to_stored
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
@@ -25,8 +29,8 @@ BAD = [
     (["train", WORLD, "--preset", "mujco"], "did you mean 'mujoco'?"),
     (["train", WORLD, "--treshold", "0.2"], "did you mean '--threshold'?"),
     (["train", WORLD, "--threshold"], "expected one argument"),
-    (["train", WORLD, "--filter", "sanua"], "did you mean 'sauna'?"),
-    (["train", WORLD, "--filter", "nowhere:it"], "cannot import 'nowhere'"),
+    (["train", WORLD, "--arm", "sauna", "--filter", "sanua"], "did you mean 'sauna'?"),
+    (["train", WORLD, "--arm", "sauna", "--filter", "nowhere:it"], "cannot import 'nowhere'"),
     (["train", WORLD, "--minibatches", "33"], "33 does not divide rollout_steps x envs = 2048"),
     (["train", WORLD, "--steps", "-5"], "steps: must be at least 1"),
     (["train", WORLD, "--steps", "100"], "less than one rollout"),
@@ -43,27 +47,54 @@ BAD = [
     (["train", WORLD, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
     (["train", WORLD, "--arm", "random-drop"], "random-drop needs a rate"),
     (["train", WORLD, "--arm", "random-drop", "--drop-rate-from", "no"], "not a run directory"),
-    (["train", WORLD, "--gae-over", "kept"], "kept needs truncation=terminate"),
+    (["train", WORLD, "--arm", "sauna", "--gae-over", "kept"], "kept needs truncation=terminate"),
     (["train", WORLD, "--network", "nature-cnn"], "does not fit vector observations"),
     (["train", WORLD, "--env-processes", "3"], "more worker processes than environments"),
     (["train", "worlds:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
     (["train", "worlds:Picture", "--hidden", "8"], "hidden: not read"),
-    (["train", WORLD, "--seeds", "123456"], "write 123456,"),
-    (["train", WORLD, "--filter", "worlds:Scripted"], "is not a sauna.Filter"),
-    (["train", WORLD, "--vex-target", "worlds:Scripted"], "is not a sauna.VexTarget"),
+    (["train", WORLD, "--seeds", "123456"], "for the one seed 123456 write --seed 123456"),
+    (["train", WORLD, "--arm", "sauna", "--filter", "worlds:Scripted"], "not a sauna.StepFilter"),
+    (
+        ["train", WORLD, "--arm", "sauna", "--vex-target", "worlds:Scripted"],
+        "is not a sauna.VexTarget",
+    ),
     (["train", WORLD, "--network", "worlds:Scripted"], "is not a flax.linen module"),
     (["train", "worlds:ConstantReward", "--log-std-init", "1"], "log_std_init: not read"),
     (["train", "worlds:Picture", "--normalize-observations"], "have no running moments"),
     (["train", "worlds:Misshapen"], "of shape (3,), and gives (1,)"),
     (["train", "worlds:Misshapen", "--env-kwargs", '{"size": 4}'], "shape (3,), and gives (4,)"),
-    (["train", WORLD, "--filter", "jax_worlds:misspelt"], "has no attribute 'treshold'"),
     (
-        ["train", WORLD, "--filter", "jax_worlds:too_long"],
+        ["train", WORLD, "--arm", "sauna", "--filter", "jax_worlds:misspelt"],
+        "has no attribute 'treshold'",
+    ),
+    (
+        ["train", WORLD, "--arm", "sauna", "--filter", "jax_worlds:too_long"],
         "a mask of shape (2,) and type bool",
     ),
-    (["train", WORLD, "--filter", "jax_worlds:forgetting"], "a state of other arrays"),
-    (["train", WORLD, "--vex-target", "jax_worlds:summed"], "gives shape () instead of (2048, 1)"),
+    (
+        ["train", WORLD, "--arm", "sauna", "--filter", "jax_worlds:forgetting"],
+        "a state of other arrays",
+    ),
+    (
+        ["train", WORLD, "--arm", "sauna", "--vex-target", "jax_worlds:summed"],
+        "gives shape () instead of (2048, 1)",
+    ),
     (["train", "worlds:Broken", "--env-kwargs", '{"broken": "step"}'], "cannot be played"),
+    (["train", WORLD, "--threshold", "0.8"], "threshold: not read by arm ppo"),
+    (["train", WORLD, "--n-steps", "64"], "here it is '--rollout-steps': kept steps"),
+    (["train", WORLD, "--num_envs=4"], "here it is '--envs': environments per member"),
+    (["train", WORLD, "--lr", "1e-3"], "here it is '--learning-rate'"),
+    (["train", WORLD, "--total-timesteps", "1e6"], "here it is '--steps'"),
+    (["train", WORLD, "--target-kl", "0.01"], "`--stop target-kl` stops an iteration"),
+    (["train", WORLD, "--batch-size", "100"], "batch_size: 100 does not divide"),
+    (["train", WORLD, "--batch-size", "0"], "batch_size: 0 does not divide"),
+    (["train", WORLD, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
+    (["train", WORLD, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
+    (["train", WORLD, "--seed", "1,2"], "seed: cannot read '1,2' as a whole number"),
+    (["compare", WORLD, "--ent-coef", "0.1"], "here it is '--entropy-coef'"),
+    (["resume", "nothere", "--steps", "9"], "a resumed run computes what it began with"),
+    (["resume", "nothere", "--n-steps", "9"], "a resumed run computes what it began with"),
+    (["resume", "nothere", "--procesess", "2"], "did you mean '--processes'?"),
     (["train"], "no environment given"),
     (["train", "--config", "none.json"], "cannot read none.json"),
     (["resume", "nothere"], "nothere is not a run directory"),
@@ -106,7 +137,9 @@ def test_bad_input_is_found_without_importing_jax(tmp_path) -> None:
 
 def test_train_resume_eval_and_list_together(tmp_path) -> None:
     run = tmp_path / "run"
-    done = sauna("train", WORLD, "--out", str(run), *small_flags(seeds=2), cwd=tmp_path)
+    done = sauna(
+        "train", WORLD, "--out", str(run), *small_flags(seeds=2, arm="sauna"), cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert "compiling" in done.stdout and "sauna/1: return" in done.stdout
     assert {p.name for p in run.iterdir()} == {
@@ -166,21 +199,15 @@ def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> 
     assert rows == [row for row in run_directory.rows(first) if row["seed"] == 4]
 
 
-def test_processes_that_the_machine_decided_are_not_repeated() -> None:
-    given = {"env": WORLD, "seeds": 2}
-    stored = {**to_json(resolve(given)), "processes": 2}
-    assert given_by(stored, given) == given
-    assert given_by(stored, {**given, "processes": 2})["processes"] == 2
-
-
-def test_a_value_edited_in_config_json_counts(tmp_path) -> None:
-    given = {"env": WORLD, "arm": "sauna", "seeds": "2"}
-    stored = to_json(resolve(given))
-    stored["threshold"] = 0.9
-    assert resolve(given_by(stored, given)).threshold == 0.9
-    stored["treshold"] = 0.9
+def test_a_value_edited_in_config_json_counts() -> None:
+    stored = to_stored(resolve_run({"env": WORLD, "arm": "ppo,sauna", "seeds": "2"}))
+    stored["config"] |= {"threshold": 0.9, "processes": 2, "out": "there"}
+    again = overrides_of(read_stored(stored))
+    assert resolve(again).threshold == 0.9
+    assert not {"processes", "out"} & set(again)  # a new run has its own
+    stored["config"]["treshold"] = 0.9
     with pytest.raises(BadInput, match="did you mean 'threshold'"):
-        resolve(given_by(stored, given))
+        read_stored(stored)
 
 
 def test_every_field_has_a_flag_and_a_help_line(capsys) -> None:
@@ -190,6 +217,67 @@ def test_every_field_has_a_flag_and_a_help_line(capsys) -> None:
     for name, field in FIELDS.items():
         assert len(field.metadata["help"]) > 5
         assert name == "env" or flag(name) in text
+
+
+def help_of(*arguments: str) -> str:
+    """The help of a command, its lines joined."""
+    command = cli._subparser(cli.make_parser(arguments), arguments[0])
+    return " ".join(command.format_help().split())
+
+
+def test_help_shows_what_most_need_first_with_types_and_the_presets_values() -> None:
+    text = help_of("train", "--preset", "atari")
+    places = [text.index(word) for word in ("most needed", "--arm NAME", "learning (defaults of")]
+    assert places == sorted(places) and text.index("--seed INT") < text.index("--gae-lambda")
+    assert "--arm NAME,... what to train" in text and "(default ppo)" in text
+    assert "preset atari" in text
+    assert (
+        "--clip-range FLOAT clip range of the probability ratio (and the value) (default 0.1)"
+        in text
+    )
+    assert "--envs INT environments per member (N) (default 8)" in text
+    assert "--optimizer adam|rmsprop" in text
+    assert "(default 0.2)" in help_of("train")
+    assert "(default 16)" in help_of("train", "--algorithm=a2c")
+    assert "--clip-range" in help_of("train", "--preset", "no such")  # is refused later
+
+
+def test_compare_says_its_own_defaults() -> None:
+    text = help_of("compare")
+    assert "or which ones (100,101,110) (default 6)" in text
+    assert "(default sauna)" in text and "(default ppo,vex-head,random-drop,sauna)" in text
+
+
+def test_one_seed_and_samples_per_minibatch() -> None:
+    assert translate({"seed": "7"}) == {"seeds": (7,)}
+    assert translate({"batch_size": 64}) == {"minibatches": 32}
+    atari = {"preset": "atari", "envs": "16", "batch_size": "512"}
+    assert translate(atari) == {"preset": "atari", "envs": "16", "minibatches": 4}
+    assert translate({"seed": None, "gamma": 0.9}) == {"gamma": 0.9}
+
+
+def test_seed_and_batch_size_replace_what_a_file_says(tmp_path) -> None:
+    file = tmp_path / "settings.json"
+    file.write_text(json.dumps({"env": WORLD, "seeds": [1, 2], "minibatches": 4}))
+    typed = {"seed": "7", "batch_size": "256"}
+    merged = cli._over(cli._overrides_in(str(file)), typed)
+    assert merged == {"env": WORLD, "seeds": (7,), "minibatches": 8}
+
+
+def test_what_a_large_count_of_seeds_means_is_said() -> None:
+    assert "42 seeds, 0 to 41; for the one seed 42 write --seed 42" in str(
+        many_seeds((*range(42),))
+    )
+    assert many_seeds((42,)) is None and many_seeds(tuple(range(6))) is None
+    assert many_seeds(tuple(range(100, 142))) is None  # which nobody types as a count
+
+
+def test_other_trainers_names_lead_to_fields() -> None:
+    for ours in SAME.values():
+        assert ours in FIELDS or ours in ACCEPTED
+    assert not set(SAME) & set(FIELDS) and not set(ADVICE) & set(FIELDS)
+    with pytest.raises(BadInput, match="unknown key 'ent_coef'; here it is 'entropy_coef'"):
+        resolve({"env": "x", "ent_coef": 0.1})
 
 
 def test_config_goes_through_json_unchanged() -> None:
@@ -311,8 +399,8 @@ def test_presets_are_the_published_numbers() -> None:
 
 def test_arms_are_the_options_table() -> None:
     def options(arm: str) -> tuple:
-        given = {"env": "x", "arm": arm, **({"drop_rate": 0.1} if arm == "random-drop" else {})}
-        c = members(resolve(given), given)[0].config
+        rate = {"drop_rate": 0.1} if arm == "random-drop" else {}
+        c = resolve_run({"env": "x", "arm": arm, **rate}).arms[arm]
         return (
             c.filter,
             c.vex_coef,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sauna.algorithm.learner.vex_targets import VexTarget
-    from sauna.algorithm.types import Filter
+    from sauna.algorithm.types import StepFilter
     from sauna.api import Result, compare, load, resume, train
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
@@ -17,10 +17,10 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BadInput",
-    "Filter",
     "JaxEnv",
     "Result",
     "SaunaError",
+    "StepFilter",
     "Transition",
     "VexTarget",
     "compare",
@@ -43,7 +43,7 @@ _HOMES = {
     "Transition": "sauna.envs.device.contract",
     "evaluate": "sauna.experiments.evaluate.episodes",
     "inspect": "sauna.experiments.inspect.command",
-    "Filter": "sauna.algorithm.selection.vex_filter",
+    "StepFilter": "sauna.algorithm.types",
     "VexTarget": "sauna.algorithm.learner.vex_targets",
 }
 

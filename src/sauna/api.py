@@ -1,4 +1,4 @@
-"""The Python face: `sauna.train`, `sauna.resume`, `sauna.load`."""
+"""The Python interface: `sauna.train`, `sauna.resume`, `sauna.load`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config import local
+from sauna.config.accepted import translate
 from sauna.config.plugins import is_local, name_of
 from sauna.config.presets import COMPARED, parse_all
+from sauna.config.settings import fields_with
 from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
@@ -16,7 +18,7 @@ from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
 
-PARTS = ("env", "network", "filter", "vex_target")  # what a user may pass by value
+PARTS = fields_with("plugin")  # what a user may pass by value
 
 
 class Result:
@@ -55,19 +57,18 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
       env: a Gymnasium id, `module:function`, or a function that makes an environment.
       quiet: show nothing.
       **settings: any field of `sauna.config.settings.Config` (`arm="sauna"`, `seeds=6`,
-        `steps=1_000_000`); functions, flax modules, filters and targets may be passed by value.
+        `steps=1_000_000`), `seed=7` for the one seed 7, `batch_size` for samples per minibatch;
+        functions, flax modules, filters and targets may be passed by value.
 
     Raises:
       BadInput: a setting is not usable; nothing was created.
       SaunaError: training failed; the last good checkpoint is on disk.
     """
-    given = {"env": name_of(env)}
-    for name, value in settings.items():
-        given[name] = name_of(value) if name in PARTS and value is not None else value
-    if settings.get("out") is not None:
-        given["out"] = str(settings["out"])
+    overrides = translate({"env": name_of(env), **{n: _named(n, v) for n, v in settings.items()}})
+    if overrides.get("out") is not None:
+        overrides["out"] = str(overrides["out"])
     display: Display = _Silent() if quiet else make_display()
-    run = runs.start(given, display)
+    run = runs.start(overrides, display)
     train_and_draw(run, display, resume=False)
     return Result(run.path)
 
@@ -118,23 +119,16 @@ def compare(
     """
     from sauna.experiments.study.command import compare_command, comparison, study
 
-    given = {"env": name_of(env), **settings}
+    overrides = {"env": name_of(env), **{n: _named(n, v) for n, v in settings.items()}}
     for name in PARTS:
-        if name in given:
-            given[name] = name_of(given[name])
-            if is_local(given[name]):
-                raise BadInput(f"{name}: other processes cannot import it; put it into a module")
-    task = given.pop("env")
-    spec = comparison(task, tuple(arms), parse_all(given))
-    command = compare_command(task, tuple(arms), given, out)
-    return study(
-        spec,
-        Path(out),
-        command,
-        processes,
-        quiet=quiet,
-        accept_changed_code=accept_changed_code,
-    )
+        if is_local(str(overrides.get(name))):
+            raise BadInput(f"{name}: other processes cannot import it; put it into a module")
+    task = overrides.pop("env")
+    overrides = translate(overrides)
+    spec = comparison(task, tuple(arms), parse_all(overrides))
+    command = compare_command(task, tuple(arms), overrides, out)
+    accept = accept_changed_code
+    return study(spec, Path(out), command, processes, quiet=quiet, accept_changed_code=accept)
 
 
 def resume(
@@ -176,6 +170,11 @@ def load(path: str | Path, member: int | str = 0, *, trust: bool = False, **part
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
     return TrainedPolicy(load_artifact(Path(path), trust=trust), member)
+
+
+def _named(name: str, value: Any) -> Any:
+    """Names a part that was passed by value; other values stay."""
+    return name_of(value) if name in PARTS and value is not None else value
 
 
 def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:

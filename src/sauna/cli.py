@@ -10,17 +10,58 @@ import argparse
 import os
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config.presets import ARM_HELP, COMPARED, DECIDED, PRESET_HELP, given_by, parse_all
-from sauna.config.settings import FIELDS, FILTERS, NATIVE, TYPES, VEX_TARGETS, flag
-from sauna.system.errors import BadInput, Interrupted, SaunaError, nearest, printable
+from sauna.config.accepted import translate
+from sauna.config.flags import add_fields, shown_values
+from sauna.config.other_names import flag_hint
+from sauna.config.presets import (
+    ARM_HELP,
+    COMPARED,
+    COMPARED_SEEDS,
+    CONTROL_HELP,
+    FILTER_HELP,
+    PRESET_HELP,
+    RULE_HELP,
+    TARGET_HELP,
+    overrides_of,
+    parse_all,
+)
+from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
+from sauna.config.stored import read_stored
+from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.tracebacks import user_frames
 
-LISTS = ("envs", "atari", *NATIVE, "arms", "presets", "filters", "targets", "studies")
-_PLACE = ("out", "processes", "on", "address", "accept_changed_code")  # of a comparison or a study
+LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
+# Where a comparison or a study trains.
+_PLACE: dict[str, dict[str, Any]] = {
+    "out": {
+        "default": "runs",
+        "metavar": "DIR",
+        "help": "where runs and results go (default runs)",
+    },
+    "processes": {
+        "default": "0",
+        "metavar": "INT",
+        "help": "trainings at a time (default 0: one per core)",
+    },
+    "on": {
+        "default": "local",
+        "choices": ("local", "ray"),
+        "help": "where to train: this machine, or a Ray cluster (default local)",
+    },
+    "address": {
+        "default": "",
+        "help": "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)",
+    },
+    "accept_changed_code": {
+        "action": "store_true",
+        "help": "go on with runs whose environment's or plug-in's code is not what it was",
+    },
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -28,86 +69,75 @@ class _Parser(argparse.ArgumentParser):
         raise BadInput(message)
 
 
-def make_parser() -> argparse.ArgumentParser:
+def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Makes the parser; `arguments` name the preset and arm whose defaults the help shows."""
+    values = shown_values(arguments)
     parser = _Parser(
         prog="sauna", description=__doc__.splitlines()[0] if __doc__ else None, allow_abbrev=False
     )
     parser.add_argument("--version", action="version", version=f"sauna {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
 
-    train = commands.add_parser("train", help="train a population", allow_abbrev=False)
+    usage = "sauna %s ENV [--OPTION VALUE ...]"
+    text = "train a population"
+    train = commands.add_parser("train", help=text, usage=usage % "train", allow_abbrev=False)
     train.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
     train.add_argument("--config", metavar="FILE", help="settings of a run's config.json")
-    _add_fields(train, [name for name in FIELDS if name != "env"])
+    add_fields(train, [name for name in FIELDS if name != "env"], values)
 
     resume = commands.add_parser("resume", help="continue a run", allow_abbrev=False)
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    from sauna.config.presets import RESUMABLE
-
-    _add_fields(resume, list(RESUMABLE))
+    add_fields(resume, fields_with("resumable"), {**values, **dict.fromkeys(FIELDS, "")})
 
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
     )
-    evaluate.add_argument("run", metavar="RUN", help="run directory")
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
-    text = "the most likely action (default: sampled, as in training)"
-    evaluate.add_argument("--deterministic", action="store_true", help=text)
-    evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
     evaluate.add_argument("--video", action="store_true", help="film the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
-    inspect.add_argument("run", metavar="RUN", help="run directory")
     inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
     inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")
-    text = "the most likely action (default: sampled, as in training)"
-    inspect.add_argument("--deterministic", action="store_true", help=text)
-    inspect.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
     text = "leave the pictures out: needs no renderer"
     inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
-
-    text = "run the code that the file or run names, even if another user named it"
-    for command in (train, resume, evaluate, inspect):
-        command.add_argument("--trust", action="store_true", help=text)
+    text = "the most likely action (default: sampled, as in training)"
+    for command in (evaluate, inspect):
+        command.add_argument("run", metavar="RUN", help="run directory")
+        command.add_argument("--deterministic", action="store_true", help=text)
+        command.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
-    compare = commands.add_parser("compare", help=text, allow_abbrev=False)
+    compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
     compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=text)
-    _add_fields(compare, [n for n in FIELDS if n not in (*DECIDED, "arm")])
+    free = [n for n in FIELDS if n not in (*fields_with("decided_by_study"), "arm")]
+    filtered = {**shown_values(arguments, "sauna"), "seeds": COMPARED_SEEDS}
+    add_fields(compare, free, filtered)
 
     study = commands.add_parser(
         "study", help="run a study of the paper's, or your own", allow_abbrev=False
     )
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
-    text = "run the code that FILE names, even if another user named it"
-    study.add_argument("--trust", action="store_true", help=text)
+    text = "run the code that the file or run names, even if another user named it"
+    for command in (train, resume, evaluate, inspect, study):
+        command.add_argument("--trust", action="store_true", help=text)
+    resume.add_argument("--accept-changed-code", **_PLACE["accept_changed_code"])
     for command in (compare, study):
-        command.add_argument(
-            "--out", default="runs", metavar="DIR", help="where runs and results go (default runs)"
-        )
-        text = "trainings at a time (default: one per core)"
-        command.add_argument("--processes", default="0", metavar="N", help=text)
-        text = "where to train: this machine, or a Ray cluster (default local)"
-        command.add_argument("--on", default="local", choices=("local", "ray"), help=text)
-        text = "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)"
-        command.add_argument("--address", default="", help=text)
-
-    text = "go on with runs whose code (of an environment or plug-in) is not what it was"
-    for command in (resume, compare, study):
-        command.add_argument("--accept-changed-code", action="store_true", help=text)
+        place = command.add_argument_group("where it trains")
+        for name, how in _PLACE.items():
+            place.add_argument(flag(name), **how)
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
-    bench = commands.add_parser("bench", help=text, allow_abbrev=False)
+    bench = commands.add_parser("bench", help=text, usage=usage % "bench", allow_abbrev=False)
     bench.add_argument(
         "env", nargs="?", metavar="ENV", default="HalfCheetah-v5", help="default: HalfCheetah-v5"
     )
@@ -122,28 +152,12 @@ def make_parser() -> argparse.ArgumentParser:
     text = "the rate against members, environments, width and processes instead"
     bench.add_argument("--scale", action="store_true", help=text)
     bench.add_argument("--json", metavar="FILE", help="also write the figures there")
-    _add_fields(bench, [n for n in FIELDS if n not in ("env", "steps", "out", "drop_rate_from")])
+    own = ("env", "steps", "out", "drop_rate_from")
+    add_fields(bench, [n for n in FIELDS if n not in own], {**values, "seeds": 6})
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
     lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
     return parser
-
-
-def _add_fields(parser: argparse.ArgumentParser, names: list[str]) -> None:
-    for name in names:
-        field = FIELDS[name]
-        text = field.metadata["help"].replace("%", "%%")
-        if field.metadata["choices"]:
-            text += f" [{', '.join(field.metadata['choices'])}]"
-        default = field.default
-        if isinstance(default, tuple):
-            default = ",".join(map(str, default))
-        text += "" if default == "" else f" (default {default})"
-        if TYPES[name] is bool:
-            action = argparse.BooleanOptionalAction
-            parser.add_argument(flag(name), action=action, default=argparse.SUPPRESS, help=text)
-        else:
-            parser.add_argument(flag(name), default=argparse.SUPPRESS, help=text, metavar="VALUE")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -176,7 +190,7 @@ def _fail(message: object, code: int) -> NoReturn:
 
 
 def _run(arguments: list[str]) -> None:
-    parser = make_parser()
+    parser = make_parser(arguments)
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
         flags = [
@@ -184,7 +198,8 @@ def _run(arguments: list[str]) -> None:
             for action in _subparser(parser, parsed.command)._actions
             for option in action.option_strings
         ]
-        raise BadInput(f"unknown argument {unknown[0]!r}{nearest(unknown[0].split('=')[0], flags)}")
+        hint = flag_hint(unknown[0], flags, parsed.command)
+        raise BadInput(f"unknown argument {unknown[0]!r}{hint}")
     values = {name: value for name, value in vars(parsed).items() if name != "command"}
     if parsed.command is None:
         parser.print_help()
@@ -204,20 +219,27 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    given = _given_from(values.pop("config"), values.pop("trust"))
+    stored = _overrides_in(values.pop("config"), values.pop("trust"))
     env = values.pop("env")
-    given |= values | ({"env": env} if env else {})
+    overrides = _over(stored, values | ({"env": env} if env else {}))
     display = make_display()
-    if runs.follows(given):
-        runs.follow(given, display)
+    if runs.follows(overrides):
+        runs.follow(overrides, display)
         return
-    run = runs.start(given, display)
+    run = runs.start(overrides, display)
     train_and_draw(run, display, resume=False)
     print(f"learning curve: {run.path}/figures/learning_curve.png")
 
 
-def _given_from(file: str | None, trust: bool) -> dict[str, Any]:
-    """Settings of a `config.json` (of a run), or of a JSON file of plain settings.
+def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
+    """Puts what is typed over what a file says; `--seed` and `--batch-size` count as typed."""
+    replaced = {"seed": "seeds", "batch_size": "minibatches"}
+    gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
+    return translate({k: v for k, v in stored.items() if k not in gone} | typed)
+
+
+def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
+    """Reads the settings of a `config.json` (of a run), or of a JSON file of plain settings.
 
     Raises:
       BadInput: it cannot be read, or names code of somebody else's, which `trust` allows.
@@ -229,9 +251,7 @@ def _given_from(file: str | None, trust: bool) -> dict[str, Any]:
 
     stored = read_config_file(Path(file))
     check_trusted(stored, file, stored.pop("seal", None), trust)
-    if "config" in stored and "given" in stored:
-        return given_by(stored["config"], stored["given"])
-    return stored
+    return overrides_of(read_stored(stored)) if "config" in stored else stored
 
 
 def _resume(values: dict[str, Any]) -> None:
@@ -295,6 +315,7 @@ def _compare(values: dict[str, Any]) -> None:
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
+    values = translate(values)
     spec = comparison(env, arms, parse_all(values))
     _run_study(spec, compare_command(env, arms, values, place["out"]), **place)
 
@@ -326,39 +347,40 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: An
 def _bench(values: dict[str, Any]) -> None:
     import json
 
-    fixed = ("iterations", "seeds", "processes", "envs", "rollout_steps", "hidden")
+    scale = values.pop("scale")
+    fixed = ("iterations", "seed", "seeds", "processes", "envs", "rollout_steps", "hidden")
     unread = [name for name in fixed if name in values] + ["against"] * bool(values["against"])
-    if values["scale"] and unread:
+    if scale and unread:
         raise BadInput(f"{unread[0]}: not read with --scale")
     values.setdefault("iterations", "50")
     rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 2)
     against, file = values.pop("against"), values.pop("json")
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")
-    given = {"arm": "ppo", "seeds": 6, **values}
     script = values["script"]
     if (against == "cleanrl") != bool(script) or (script and not Path(script).is_file()):
         raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
-    for name in ("rounds", "iterations", "scale", "script"):
-        del given[name]
-    from sauna.config.presets import plain, resolve
+    for name in ("rounds", "iterations", "script"):
+        del values[name]
+    overrides = {"seeds": 6, **translate({"arm": "ppo", **values})}
+    from sauna.config.presets import plain, resolve_run
     from sauna.experiments.bench.command import bench, bench_scale, report
     from sauna.experiments.bench.device import bench_on_device, report_on_device, scale_on_device
-    from sauna.training.prepare import placed
+    from sauna.training.prepare import place
 
-    native = placed(resolve(plain(given))).backend == "device"
-    if native and values["scale"]:
-        result = scale_on_device(given, rounds, iterations, _say)
+    native = place(resolve_run(plain(overrides))).config.backend == "device"
+    if native and scale:
+        result = scale_on_device(overrides, rounds, iterations, _say)
     elif native:
         result = bench_on_device(
-            given, rounds=rounds, iterations=iterations, against=against, say=_say
+            overrides, rounds=rounds, iterations=iterations, against=against, say=_say
         )
         print("\n".join(report_on_device(result)))
-    elif values["scale"]:
-        result = bench_scale(given, rounds, _say)
+    elif scale:
+        result = bench_scale(overrides, rounds, _say)
     else:
         result = bench(
-            given,
+            overrides,
             rounds=rounds,
             iterations=iterations,
             against=against,
@@ -396,6 +418,11 @@ def _list(values: dict[str, Any]) -> None:
 
         for name in names_of(what):
             print(name)
+    elif what == "rules":
+        for name, text in {**RULE_HELP, **CONTROL_HELP}.items():
+            stage, _, sentence = text.partition(": ")
+            print(f"{name:15} {stage:8} {sentence}")
+        print("\nJoin rules by +, such as sauna+avec, and a control to a rule: gigaflow+random")
     elif what == "studies":
         from sauna.experiments.study.spec import built_in
 
@@ -413,29 +440,6 @@ def _list(values: dict[str, Any]) -> None:
             print(f"{name:{width}}  {text}")
 
 
-FILTER_HELP = dict(
-    zip(
-        FILTERS,
-        (
-            "keep everything",
-            "keep where |Vex| / |median of earlier Vex| reaches the threshold (eq. 7)",
-            "drop at random at a given rate",
-        ),
-        strict=True,
-    )
-)
-TARGET_HELP = dict(
-    zip(
-        VEX_TARGETS,
-        (
-            "eq. 5 over one actor's rollout, one number for all its states (the paper)",
-            "1 - Var(R - V) / Var(R) over each minibatch (the released code)",
-            "eq. 5 over each stretch of one episode",
-            "each state's own share of eq. 5",
-        ),
-        strict=True,
-    )
-)
 _COMMANDS = {
     "train": _train,
     "resume": _resume,

@@ -9,7 +9,7 @@ import pytest
 
 import sauna
 from helpers import SMALL, equal, make_job, own, train_here
-from sauna.config.presets import members, resolve
+from sauna.config.presets import resolve, resolve_run
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
 
@@ -95,15 +95,16 @@ def test_arms_that_differ_in_traced_values_share_a_program() -> None:
 
 
 def test_unfiltered_arms_take_the_rules_of_the_filtered_one() -> None:
-    given = {"env": "x", "arm": "ppo,sauna-reference"}
-    ppo, reference = members(resolve(given), given)[0::1][0].config, resolve(given)
+    arms = resolve_run({"env": "x", "arm": "ppo,sauna-reference"}).arms
+    ppo, reference = arms["ppo"], arms["sauna-reference"]
     for name in ("truncation", "budget", "gae_over", "decision"):
         assert getattr(ppo, name) == getattr(reference, name)
     assert (ppo.threshold, ppo.vex_coef, reference.vex_coef) == (0.0, 0.0, 0.5)
 
 
 def test_arms_of_other_programs_are_refused() -> None:
-    for arms in ("sauna,random-drop", "sauna,sauna-reference", "sauna,sauna-paper"):
+    refused = ("sauna,random-drop", "sauna,sauna-reference", "sauna,sauna-paper")
+    for arms in (*refused, "ppo,gigaflow", "gigaflow,ppo", "ppo,avec", "ppo,sauna+avec"):
         with pytest.raises(BadInput, match="shapes the compiled program"):
             resolve(
                 {"env": "x", "arm": arms, "drop_rate": 0.1}

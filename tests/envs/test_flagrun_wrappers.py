@@ -169,7 +169,7 @@ def test_feet_touch_the_ground_that_they_stand_on() -> None:
 PICTURE = f"""
 from sauna.experiments.evaluate.episodes import choose_renderer
 choose_renderer()
-from sauna.envs.host.gymnasium_envs import make_env
+from sauna.envs.make import make_env
 env = make_env({ID!r}, {{}}, render_mode="rgb_array")
 env.reset(seed=0)
 picture = env.render()

@@ -4,7 +4,7 @@
     python tests/faults/campaign.py --row 2 --row 9 these rows only
     python tests/faults/campaign.py --again         also what is there already
     python tests/faults/campaign.py --scale small   what `make test` tries; nothing is stored
-    python tests/faults/campaign.py --docs          docs/reliability.md from the file, no trials
+    python tests/faults/campaign.py --docs          the tables of the page on reliability
 
 A row is kept as long as the sources that it was measured with are the same.
 """
@@ -24,7 +24,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path[:0] = [str(ROOT / "src"), str(ROOT / "tests")]
 RESULTS = ROOT / "results" / "reliability.json"
-DOCS = ROOT / "docs" / "reliability.md"
+DOCS = ROOT / "docs" / "concepts" / "reliability.md"
 SEED = 20240229
 
 # Row: what is broken, the module of its experiment, tries in full and small.

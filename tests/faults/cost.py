@@ -83,16 +83,16 @@ def of_the_update() -> float:
         envs = make_envs(job)
         collector = HostCollector(program, job.spaces, envs, [key])
         collector.start()
-        learner = make_learner(job.config, program.policy)
+        learner = make_learner(job.config, program.policy, job.spaces)
         state = learner.init(key.init)
         limit = np.array([job.config.rollout_steps])
         (told,) = collector.collect(np.asarray(state.params)[None], [hypers], 0, limit)
         envs.close()
-        batch = learner.make_batch(told.rollout, hypers)
+        batch = learner.make_batch(told.rollout, hypers, key.order)
 
         def call() -> None:
             nonlocal state  # used up by each call
-            state, metrics = learner.learn(state, told.rollout, batch, hypers, order)
+            state, metrics = learner.learn(state, told.rollout, batch, hypers, order, key.order)
             jax.block_until_ready(metrics)
 
         call()

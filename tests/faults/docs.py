@@ -1,4 +1,4 @@
-"""The figures of `docs/reliability.md`, from the files under `results/`."""
+"""The figures of `docs/concepts/reliability.md`, from the files under `results/`."""
 
 from __future__ import annotations
 

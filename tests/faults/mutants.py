@@ -59,9 +59,9 @@ MUTANTS = [
         "advantages",
         ("value is added", "* next_value - value\n", "* next_value + value\n"),
         ("no bootstrap mask", "gamma * bootstrap * next_value", "gamma * next_value"),
-        ("no mask between episodes", "gae_lambda * goes_on_t * later", "gae_lambda * later"),
-        ("no lambda", "gamma * gae_lambda * goes_on_t", "gamma * goes_on_t"),
-        ("no gamma in the sum", "gamma * gae_lambda * goes_on_t", "gae_lambda * goes_on_t"),
+        ("no mask between episodes", "gae_lambda * not_last_t * later", "gae_lambda * later"),
+        ("no lambda", "gamma * gae_lambda * not_last_t", "gamma * not_last_t"),
+        ("no gamma in the sum", "gamma * gae_lambda * not_last_t", "gae_lambda * not_last_t"),
         ("forwards in time", "reverse=True", "reverse=False"),
     ),
     *_of(

@@ -109,7 +109,7 @@ class Nursery:
     ) -> Process:
         """Starts `sauna ARGUMENTS`; not before `time.monotonic()` is `at`.
 
-        `silence` stands in for `watchdog.SILENCE`.
+        `silence` stands in for `watchdog.MAX_SILENCE`.
         """
         question = {"start": arguments, "log": str(log), "at": at, "silence": silence}
         return Forked(self, self.ask(question)["pid"], log)
@@ -240,7 +240,7 @@ def _run(arguments: list[str], log: str, at: float, silence: float) -> None:
     from sauna.system import watchdog
     from sauna.training import coordinator
 
-    coordinator.start_worker, watchdog.SILENCE = _fork_worker, silence
+    coordinator.start_worker, watchdog.MAX_SILENCE = _fork_worker, silence
     time.sleep(max(0.0, at - time.monotonic()))
     code = 0
     try:

@@ -17,8 +17,8 @@ from faults.canned import BACKENDS, Trap, played_back, record, trained_here, unt
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
-from sauna.config.presets import RESUMABLE
-from sauna.config.settings import FIELDS, TYPES
+from sauna.config import presets
+from sauna.config.settings import FIELDS, TYPES, fields_with
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -55,7 +55,7 @@ def _change_everything(
     with played_back(record(world)):
         until(whole, Trap(), world)
         (whole / "summary.json").unlink()
-        names = [name for name in FIELDS if name not in (*RESUMABLE, "out")]
+        names = [name for name in FIELDS if name not in (*fields_with("resumable"), "out")]
         for name in names if least >= 40 else rng.sample(names, least - 3):
             _change_setting(whole, place / "run", name, tally)
         for name in ("format", "spaces", "members"):
@@ -159,7 +159,7 @@ def test_an_older_format_is_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyP
         checkpoint.load_checkpoint(path)
 
     def rename(old: dict[str, Any]) -> dict[str, Any]:
-        return {**old, "members": old.pop("names"), "format": 1}
+        return {**old, "members": old.pop("names")}
 
     monkeypatch.setitem(checkpoint.MIGRATIONS, 0, rename)
     assert checkpoint.load_checkpoint(path).manifest["members"] == ["ppo/0"]
@@ -184,6 +184,22 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()
     assert rows[:kept] == old[:kept] and len(run_directory.rows(run)) == 6
+
+
+def test_an_old_run_ends_alike_under_other_presets(tmp_path: Path, monkeypatch) -> None:
+    """What 0.1.0 stored is enough: nothing is taken from the presets, arms or defaults of today."""
+    ended = []
+    for name in ("first", "second"):
+        shutil.copytree(GOLDEN / "format-1-host", tmp_path / name)
+        with trained_here():
+            sauna.resume(tmp_path / name, quiet=True)
+        newest = checkpoint.load_newest(tmp_path / name / "checkpoints", print)
+        assert newest is not None and newest.manifest["arms"] == {"ppo": {}}
+        ended.append((newest.manifest["sha256"], (tmp_path / name / "metrics.jsonl").read_bytes()))
+        other = {"learning_rate": 0.1, "gamma": 0.5, "vex_coef": 0.9}
+        monkeypatch.setitem(presets.PRESETS, "mujoco", other)
+        monkeypatch.setitem(presets.ARMS, "ppo", {"filter": "sauna", "vex_coef": 0.2})
+    assert ended[0] == ended[1]
 
 
 def test_other_versions_of_the_libraries_are_told(tmp_path: Path, capsys, monkeypatch) -> None:

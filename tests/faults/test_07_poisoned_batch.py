@@ -35,7 +35,7 @@ class _Learner:
     def __init__(self, **settings: int) -> None:
         job = make_job("worlds:Scripted", arm="sauna", **settings)
         self.config = job.config
-        self.learner = make_learner(job.config, make_policy(job.config, job.spaces))
+        self.learner = make_learner(job.config, make_policy(job.config, job.spaces), job.spaces)
         rng, number = np.random.default_rng(0), job.config.rollout_steps
         draw = lambda *shape: rng.normal(size=(number, *shape)).astype(np.float32)  # noqa: E731
         ones = np.ones(number, np.float32)
@@ -49,7 +49,9 @@ class _Learner:
     def learn(self, batch: Batch, hypers: Hypers) -> tuple[TrainState, bool]:
         state = self.learner.init(member_keys(0).init)
         order = minibatch_order(self.config, 0, 0)
-        state, metrics = self.learner.learn(state, self.rollout, batch, hypers, order)
+        state, metrics = self.learner.learn(
+            state, self.rollout, batch, hypers, order, member_keys(0).order
+        )
         return jax.device_get(state), bool(metrics.finite)
 
 
@@ -112,11 +114,11 @@ def test_the_run_stops_and_the_last_finite_checkpoint_is_kept(
     """The third update gets a NaN; the environment is passed by value, so it trains in here."""
     plain, calls = host._learn, []
 
-    def spoiled(program: Any, state: Any, collected: Any, hypers: Any, order: Any) -> Any:
+    def spoiled(learner: Any, state: Any, collected: Any, hypers: Any, order: Any, key: Any) -> Any:
         calls.append(0)
         if len(calls) == 3:
             hypers = hypers._replace(value_coef=np.float32(np.nan))
-        return plain(program, state, collected, hypers, order)
+        return plain(learner, state, collected, hypers, order, key)
 
     monkeypatch.setattr(host, "_learn", spoiled)
     from worlds import Scripted

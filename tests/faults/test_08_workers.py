@@ -166,7 +166,7 @@ def _strike_run(chain: Chain, process: Any, what: str, rng: random.Random, tally
     wanted = {
         "SIGKILL": (1, f"({victim}) ended with exit code -9"),
         "coordinator": (-9, ""),
-        "SIGSTOP": (1, f"({victim}) gave no sign of life for 4 s"),
+        "SIGSTOP": (1, f"({victim}) sent no heartbeat for 4 s"),
     }[what]
     named = code == wanted[0] and wanted[1] in process.said()
     if not named and not chain.is_complete():

@@ -65,7 +65,7 @@ def _resume(run: Path) -> None:
         for name in logs.NAMES:
             logs.check_own(run / name)
     finally:
-        reopened.held.close()
+        reopened.lock.close()
 
 
 def _eval(run: Path) -> None:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from arrays import no_key
 from helpers import make_job
 from sauna.algorithm.learner.program import Learner, make_learner
 from sauna.algorithm.learner.update import minibatch_order
@@ -36,7 +37,7 @@ class Trainer:
         self.job = make_job(env, seeds=MEMBERS, steps=10**6, **settings)
         self.calls: Counter[str] = Counter()
         self.program = make_program(self.job.config, self.job.spaces)
-        self.learner = make_learner(self.job.config, self.program.policy)
+        self.learner = make_learner(self.job.config, self.program.policy, self.job.spaces)
         counted = {n: self._counted(self.program, n) for n in FUNCTIONS if n in Program._fields}
         learned = {n: self._counted(self.learner, n) for n in FUNCTIONS if n in Learner._fields}
         self.keys = [member_keys(member.seed) for member in self.job.members]
@@ -73,7 +74,9 @@ class Trainer:
         collected, hypers = self.collect(iteration)
         for p, member in enumerate(self.job.members):
             order = minibatch_order(self.job.config, member.seed, iteration)
-            self.states[p], _ = _learn(self.counted, self.states[p], collected[p], hypers[p], order)
+            self.states[p], _ = _learn(
+                self.counted, self.states[p], collected[p], hypers[p], order, no_key()
+            )
             self.done[p].add(collected[p])
         return max(c.rollout.valid.any(1).sum() for c in collected)
 

@@ -17,7 +17,7 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.training import prepare
 from sauna.training.loop.device_program import make_mesh
-from sauna.training.loop.multihost import Place, read_place
+from sauna.training.loop.multihost import HostRank, read_host_rank
 
 SETTINGS = [
     "jax_worlds:walk",
@@ -192,8 +192,8 @@ def test_a_mesh_takes_as_many_devices_as_divide_the_work(
 
 
 def test_places_are_read_or_refused() -> None:
-    assert read_place("") == Place("", 1, 0)
-    assert read_place("host:1234,4,3") == Place("host:1234", 4, 3)
+    assert read_host_rank("") == HostRank("", 1, 0)
+    assert read_host_rank("host:1234,4,3") == HostRank("host:1234", 4, 3)
     for text in ("host,2,0", "host:1,2", "host:1,2,2", "host:1,1,0", "host:1,a,0"):
         with pytest.raises(BadInput, match="distributed"):
-            read_place(text)
+            read_host_rank(text)

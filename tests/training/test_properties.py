@@ -7,18 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
+from hypothesis.extra import numpy as drawn_arrays
 
-from arrays import random_rollout
+from arrays import no_key, random_rollout
 from helpers import configured
+from sauna.algorithm.learner.program import make_learner
 from sauna.algorithm.learner.update import minibatch_order
-from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.types import Hypers, member_keys
 from sauna.envs.spaces import Spaces
 from sauna.system import checkpoint
 
 CONFIG = configured(rollout_steps=40, envs=3, minibatches=4, epochs=2, hidden="5", arm="sauna")
-PROGRAM = make_program(CONFIG, Spaces("vector", (2,), "continuous", (1,), "", ""))
+SPACES = Spaces("vector", (2,), "continuous", (1,), "", "")
+LEARNER = make_learner(CONFIG, make_policy(CONFIG, SPACES), SPACES)
 HYPERS = {**dict.fromkeys(Hypers._fields, 0.1), "gamma": 0.9, "gae_lambda": 0.8}
 
 
@@ -34,18 +36,18 @@ def test_an_update_stays_finite_however_much_is_kept(seed: int, kept: str) -> No
     single = lambda x: jnp.asarray(x, np.float32 if x.dtype == float else None)  # noqa: E731
     rollout = jax.tree.map(single, rollout)
     hypers = Hypers(**{name: np.float32(value) for name, value in HYPERS.items()})
-    state = PROGRAM.init(member_keys(seed).init)
+    state = LEARNER.init(member_keys(seed).init)
     order = minibatch_order(CONFIG, seed, 0)
-    batch = PROGRAM.make_batch(rollout, hypers)
-    state, metrics = PROGRAM.learn(state, rollout, batch, hypers, order)
+    batch = LEARNER.make_batch(rollout, hypers, no_key())
+    state, metrics = LEARNER.learn(state, rollout, batch, hypers, order, no_key())
     assert bool(metrics.finite)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
 
 
 finite = st.sampled_from([np.float32, np.float64, np.int64, np.uint8, np.bool_]).flatmap(
-    lambda dtype: arrays.arrays(
+    lambda dtype: drawn_arrays.arrays(
         dtype,
-        arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+        drawn_arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
         elements={"allow_nan": False, "allow_infinity": False}
         if np.issubdtype(dtype, np.floating)
         else None,

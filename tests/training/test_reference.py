@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 
+from arrays import no_key
 from helpers import make_job
 from oracles import RunningNormalizer
 from sauna.algorithm.learner.program import make_learner
@@ -159,7 +160,7 @@ class Setup:
         )
         self.job, self.config = job, job.config
         self.program = make_program(job.config, job.spaces)
-        self.learner = make_learner(job.config, self.program.policy)
+        self.learner = make_learner(job.config, self.program.policy, job.spaces)
         self.keys = member_keys(3)
         self.params = self.program.policy.init(self.keys.init)
         envs = GymnasiumEnvs(Scripted, [(3, n) for n in range(N)])
@@ -172,7 +173,7 @@ class Setup:
         collected = self.collector.collect(
             np.asarray(self.params)[None], [self.hypers], iteration, limit
         )[0]
-        return collected, self.learner.make_batch(collected.rollout, self.hypers)
+        return collected, self.learner.make_batch(collected.rollout, self.hypers, no_key())
 
     def act(self, seen, noise):
         action = np.asarray(self.program.act(self.params[None], seen[None], noise[None]))[0]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sauna
+from faults.canned import trained_here
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna.config import presets
 from sauna.experiments.measure.streams import load_standing
@@ -46,7 +47,7 @@ def test_resuming_a_complete_run_does_nothing(tmp_path: Path, capsys) -> None:
 
 def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, capsys) -> None:
     run = tmp_path / "run"
-    sauna.train("worlds:Forgetful", out=run, **SMALL)
+    sauna.train("worlds:Forgetful", out=run, arm="sauna", **SMALL)
     said = capsys.readouterr().out
     assert "does not repeat itself" in said and "not resumed exactly" in said
     assert said.index("does not repeat") < said.index("writing to")
@@ -83,7 +84,12 @@ def make_incomplete(run: Path, iteration: int) -> None:
 def finished(tmp_path: Path, **settings) -> Path:
     run = tmp_path / "run"
     sauna.train(
-        WORLD, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=9, **{**SMALL, **settings}
+        WORLD,
+        out=run,
+        quiet=True,
+        checkpoint_every=2,
+        keep_checkpoints=9,
+        **{**SMALL, "arm": "sauna", **settings},
     )
     return run
 
@@ -117,22 +123,20 @@ def test_a_damaged_newer_checkpoint_takes_no_place_of_a_good_one(tmp_path) -> No
     assert not (tmp_path / "00000050").exists()
 
 
-def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch, capsys) -> None:
+def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch) -> None:
     """A later version may have other presets; members' own values are the run's."""
     run = finished(tmp_path)
     expected = (run / "metrics.jsonl").read_bytes()
     make_incomplete(run, 2)
     changed = {**presets.PRESETS, "mujoco": {"learning_rate": 1e-3, "gae_lambda": 0.5}}
     monkeypatch.setattr(presets, "PRESETS", changed)
-    held = runs.reopen(run, {}, make_display())
-    held.held.close()
-    assert {(m.config.learning_rate, m.config.gae_lambda) for m in held.members} == {(3e-4, 0.95)}
-    told = capsys.readouterr().out
-    assert "kept from the start: learning_rate 0.0003, gae_lambda 0.95" in told
-    standing = load_standing(run, held.members[0].name, 2)
+    opened = runs.reopen(run, {}, make_display())
+    opened.lock.close()
+    assert {(m.config.learning_rate, m.config.gae_lambda) for m in opened.members} == {(3e-4, 0.95)}
+    standing = load_standing(run, opened.members[0].name, 2)
     assert float(standing.hypers.gae_lambda) == np.float32(0.95)
-    monkeypatch.undo()
-    sauna.resume(run, quiet=True)
+    with trained_here():  # under the other presets
+        sauna.resume(run, quiet=True)
     assert (run / "metrics.jsonl").read_bytes() == expected
 
 
@@ -165,7 +169,8 @@ def test_what_a_worker_finds_unusable_is_bad_input_and_leaves_nothing(
 
 def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) -> None:
     run = tmp_path / "run"
-    sauna.train(lambda: Scripted(), out=run, checkpoint_every=2, keep_checkpoints=9, **SMALL)
+    more = {"arm": "sauna", "checkpoint_every": 2, "keep_checkpoints": 9}
+    sauna.train(lambda: Scripted(), out=run, **more, **SMALL)
     assert "can be resumed only from Python" in capsys.readouterr().out
     expected = (run / "metrics.jsonl").read_bytes()
     make_incomplete(run, 2)

@@ -60,6 +60,9 @@ class Batch(NamedTuple):
     value: Array  # [T * N]
     vex_target: Array  # [T * N]; not read when the target is computed per minibatch
     weight: Array  # [T * N] 1, or 0 for a slot that stayed empty or a masked step
+    vex: Any = None  # [T * N] the Vex head at collection, for rules of selection
+    next_observation: Any = None  # [T * N, ...] for the auxiliary head
+    next_weight: Any = None  # [T * N] 1, or 0 if the next observation is not of this episode
 
 
 class TrainState(NamedTuple):
@@ -67,6 +70,7 @@ class TrainState(NamedTuple):
 
     params: Array  # [D] float32, the raveled parameter pytree
     optimizer: Any  # optax's ScaleByAdamState (count int32, mu [D], nu [D]) or ScaleByRmsState
+    sampler: Any = ()  # what a selection rule carries from one iteration to the next
 
 
 class PolicyOutput(NamedTuple):
@@ -75,6 +79,8 @@ class PolicyOutput(NamedTuple):
     policy: Array  # [..., K] parameters of the action distribution
     value: Array  # [...]
     vex: Array  # [...]
+    hidden: Array  # [..., H] the policy's last hidden layer
+    prediction: Any  # [..., O] of the auxiliary head; None if there is none
 
 
 class Keys(NamedTuple):
@@ -87,6 +93,11 @@ class Keys(NamedTuple):
     order: Array  # of minibatches drawn on the accelerator; see `minibatch_order`
 
 
+def selection_key(keys: Keys, iteration: Any) -> Array:
+    """The key of an iteration's draws by a rule of selection, on the host and on the device."""
+    return jax.random.fold_in(jax.random.fold_in(keys.order, iteration), 1)
+
+
 def member_keys(seed: int) -> Keys:
     """Keys that depend on the member's seed alone."""
     root = jax.random.key(seed)
@@ -94,8 +105,138 @@ def member_keys(seed: int) -> Keys:
     return Keys(init, action, filter, jax.random.fold_in(root, 3), jax.random.fold_in(root, 4))
 
 
-class Filter(NamedTuple):
-    """`init(num_envs, capacity) -> state`, `keep(state, ...) -> (state, mask [N])`."""
+# ---------------------------------------------------------------------------------------------
+# Where a rule of sample selection can act. Each hook is a pure function, or a pair of them.
+
+
+class ScoredStep(NamedTuple):
+    """One vector step that is scored already: what a `StepFilter` sees.
+
+    JAX arrays, or numpy's on their way there.
+    """
+
+    observation: Any  # [N, ...] as the policy saw it
+    action: Any  # [N, A]
+    log_prob: Any  # [N]
+    value: Any  # [N] V(s)
+    vex: Any  # [N] the Vex head's prediction
+
+
+class StepFilter(NamedTuple):
+    """Stage 1, while collecting: which transitions the rollout keeps.
+
+    `init(num_envs, capacity)` gives the state at the start of a rollout in which each env acts at
+    most `capacity` times. `keep(state, step, key, hypers)` is called once per env step, in time
+    order, and returns the new state and the mask `[N]` of the envs whose transition is kept.
+    `hypers` holds the traced hyperparameters, of which `threshold` and `drop_rate` are filters'.
+    A decision never changes how an env acts. If an env's quota is full, its decision is ignored.
+    """
 
     init: Callable[[int, int], Any]
-    keep: Callable[[Any, Array, Array, Array, Hypers], tuple[Any, Array]]
+    keep: Callable[[Any, ScoredStep, Array, Hypers], tuple[Any, Array]]
+
+
+class SamplerSetup(NamedTuple):
+    """What a sampler knows before training: static numbers of the run."""
+
+    rollout_steps: int  # T
+    envs: int  # N
+    iterations: int  # of the whole budget, if no filter drops anything
+    action_kind: str
+    action_sizes: tuple[int, ...]
+
+    @property
+    def rows(self) -> int:
+        """M = T * N."""
+        return self.rollout_steps * self.envs
+
+
+class Samples(NamedTuple):
+    """What a `Sampler` sees: the `M = T * N` rows of a rollout, row `t * N + n`.
+
+    The last five fields belong to today's policy and are None unless the sampler `reads_policy`.
+    """
+
+    present: Array  # [M] bool; False: a slot that stayed empty
+    observation: Array  # [M, ...]
+    action: Array  # [M, A]
+    log_prob: Array  # [M] of the policy that acted
+    advantage: Array  # [M] raw
+    standardized: Array  # [M] (A - mean) / (std + 1e-8) over the rows that are present
+    return_: Array  # [M]
+    value: Array  # [M] at collection
+    error: Array  # [M] return_ - value
+    vex: Array  # [M] the Vex head at collection
+    log_ratio: Any = None  # [M] log-probability now minus then
+    policy: Any = None  # [M, K] parameters of the action distribution
+    hidden: Any = None  # [M, H] the policy's last hidden layer
+    entropy: Any = None  # [M]
+
+
+class Choice(NamedTuple):
+    """What a `Sampler` takes of `M` rows: a mask, or probabilities to draw by."""
+
+    keep: Any = None  # [M] bool
+    probability: Any = None  # [M], sum 1
+    weight: Any = None  # [M] multiplies the policy term; None: 1
+    value_probability: Any = None  # [M] if the value loss draws rows of its own
+    value_weight: Any = None  # [M] multiplies the terms of the value and Vex losses; None: 1
+    score: Any = None  # [M] how much the rule wants a row: what `reversed` turns round
+
+
+class Draw(NamedTuple):
+    """The rows of one epoch; the first `number` count."""
+
+    rows: Array  # [K] int32
+    value_rows: Array  # [K] int32, `rows` themselves unless the value loss draws its own
+    number: Array  # [] int32
+
+
+class Sampler(NamedTuple):
+    """Stage 2, once advantages are known: which rows the update learns from, and how often.
+
+    Attributes:
+      init: `() -> state`; the state is carried over iterations and checkpointed.
+      choose: `(state, samples, key) -> (state, choice)`.
+      share: static, the most that a choice takes: arrays have `K = ceil(share * M)` rows.
+      reads_policy: whether `samples` tell of today's policy, which takes one forward pass.
+      each_epoch: choose before each epoch instead of once per iteration.
+    """
+
+    init: Callable[[], Any]
+    choose: Callable[[Any, Samples, Array], tuple[Any, Choice]]
+    share: float = 1.0
+    reads_policy: bool = False
+    each_epoch: bool = False
+
+
+class LossTerms(NamedTuple):
+    """What a `LossWeight` sees of a minibatch of `B` rows."""
+
+    log_prob: Array  # [B] of today's policy
+    log_ratio: Array  # [B] log-probability now minus at collection
+    advantage: Array  # [B] as the loss uses it
+    entropy: Array  # [B]
+    present: Array  # [B] 1, or 0 for a row that does not count
+    continuous: bool  # whether log-probabilities are of a density
+
+
+class LossWeight(NamedTuple):
+    """A weight of each policy term in a minibatch.
+
+    Attributes:
+      weight: `terms -> (mask [B], scale [B])`; the policy loss is `sum(mask scale l) / sum(mask)`.
+      on_mean: for a Gaussian policy, scale the gradient of the mean alone.
+    """
+
+    weight: Callable[[LossTerms], tuple[Array, Array]]
+    on_mean: bool = False
+
+
+class StopRule(NamedTuple):
+    """When an iteration takes no further gradient step.
+
+    `exceeded(log_ratio [B], weight [B]) -> bool` is asked before each step.
+    """
+
+    exceeded: Callable[[Array, Array], Array]

@@ -29,15 +29,16 @@ PACKAGES = {
 }
 
 
-def code_of(config: Mapping[str, Any]) -> dict[str, str]:
-    """`{module: SHA-256, package: version}` of the code that a config names.
+def code_of(settings: Mapping[str, Any]) -> dict[str, str]:
+    """`{module: SHA-256, package: version}` of the code that settings, or a stored config, name.
 
     Its modules have been imported already; nothing is imported here.
     """
     found: dict[str, str] = {}
-    for module in _named_modules(config):
+    env = str(settings.get("config", settings).get("env"))
+    for module in _named_modules(settings, env):
         _add_module(module, found)
-    package = PACKAGES.get(str(config.get("env")).partition("/")[0])
+    package = PACKAGES.get(env.partition("/")[0])
     if package is not None:
         _add_version(package, found)
     return dict(sorted(found.items()))
@@ -57,10 +58,10 @@ def changed_code(before: Mapping[str, Any], now: Mapping[str, str]) -> str:
     return ", ".join(parts)
 
 
-def _named_modules(config: Mapping[str, Any]) -> list[str]:
-    found = [name.partition(":")[0] for _, name in named_code(config)]
+def _named_modules(settings: Mapping[str, Any], env: str) -> list[str]:
+    found = [name.partition(":")[0] for _, name in named_code(settings)]
     gymnasium: Any = sys.modules.get("gymnasium")
-    spec = gymnasium and gymnasium.registry.get(str(config.get("env")).rpartition(":")[2])
+    spec = gymnasium and gymnasium.registry.get(env.rpartition(":")[2])
     if spec is not None and isinstance(spec.entry_point, str):
         found.append(spec.entry_point.partition(":")[0])
     elif spec is not None:  # a class or a function

@@ -10,14 +10,14 @@ from sauna.system.errors import BadInput
 
 
 def read_value(name: str, value: Any, field_type: Any) -> Any:
-    """`value` as `field_type`; the fields `env_kwargs` and `seeds` have forms of their own.
+    """Reads `value` as `field_type`; the fields `..._kwargs` and `seeds` have forms of their own.
 
     Raises:
       ValueError, TypeError, KeyError: it cannot be read as that.
       BadInput: a number of seeds that is meant as a seed.
     """
-    if name == "env_kwargs":
-        return _json_object(value)
+    if name.endswith("_kwargs"):
+        return _json_object(name, value)
     if name == "seeds":
         return _seeds(value)
     if field_type is bool:
@@ -41,7 +41,7 @@ _BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, 
 
 
 def _integer(value: Any) -> int:
-    """Whole numbers, also as `1e6`; a bool or 1.5 is not one."""
+    """Reads a whole number, also as `1e6`; a bool or 1.5 is not one."""
     if isinstance(value, bool):
         raise TypeError
     if isinstance(value, int):
@@ -52,24 +52,39 @@ def _integer(value: Any) -> int:
     return int(number)
 
 
-MOST_SEEDS = 10_000
+MAX_SEEDS = 10_000
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
-    """A count (`6`, `"6"`) means seeds 0 to 5; a sequence or `"100,101"` names the seeds."""
+    """Reads a count (`6`, `"6"`: seeds 0 to 5) or the seeds themselves (a list, `"100,101"`)."""
     if isinstance(value, str) and "," in value:
         value = [part for part in value.split(",") if part.strip()]
     if isinstance(value, str | int | float):
         number = _integer(value)
-        if number > MOST_SEEDS:
-            raise BadInput(f"seeds: {number} is too many; for the seed {number} write {number},")
+        if number > MAX_SEEDS:
+            raise BadInput(
+                f"seeds: {number} is too many; for the one seed {number} write --seed {number}"
+            )
         return tuple(range(number))
-    if len(value) > MOST_SEEDS:
-        raise BadInput(f"seeds: {len(value)} are too many; at most {MOST_SEEDS}")
+    if len(value) > MAX_SEEDS:
+        raise BadInput(f"seeds: {len(value)} are too many; at most {MAX_SEEDS}")
     return tuple(_integer(seed) for seed in value)
 
 
-def _json_object(value: Any) -> str:
+MANY_SEEDS = 20  # from which a count may have been meant as a seed
+
+
+def many_seeds(seeds: tuple[int, ...]) -> str | None:
+    """Says what a large count of seeds means, for it may have been meant as a seed."""
+    number = len(seeds)
+    if number < MANY_SEEDS or seeds != tuple(range(number)):
+        return None
+    return (
+        f"note: {number} seeds, 0 to {number - 1}; for the one seed {number} write --seed {number}"
+    )
+
+
+def _json_object(name: str, value: Any) -> str:
     parsed = json.loads(value) if isinstance(value, str) else dict(value)
     if not isinstance(parsed, dict):
         raise ValueError
@@ -77,5 +92,5 @@ def _json_object(value: Any) -> str:
         return json.dumps(parsed, sort_keys=True, allow_nan=False)
     except ValueError:  # which no reader of JSON would take back
         raise BadInput(
-            "env_kwargs: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
+            f"{name}: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
         ) from None

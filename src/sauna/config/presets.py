@@ -10,7 +10,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from sauna.config.settings import FIELDS, Config, check_consistent, check_read, parse, to_json
+from sauna.config.checks import check_consistent, check_read, is_read
+from sauna.config.other_names import key_hint
+from sauna.config.settings import FIELDS, Config, fields_with, parse
 from sauna.system.errors import BadInput, nearest
 
 # Schulman et al. (2017) and OpenAI baselines' defaults for MuJoCo are `Config`'s own defaults.
@@ -102,6 +104,31 @@ ARMS: dict[str, dict[str, Any]] = {
     },
 }
 
+# A rule that ranks by |A| or by its sign leaves advantages whose mean is not 0: they are
+# standardised over the rollout before the choice, so that the rule turns no sign round.
+_PPO = {"filter": "none", "vex_coef": 0.0}
+_OVER_ROLLOUT = {**_PPO, "normalize_over": "rollout"}
+ARMS |= {
+    "gigaflow": {**_OVER_ROLLOUT, "sampler": "gigaflow"},
+    "top-advantage": {**_OVER_ROLLOUT, "sampler": "top-advantage"},
+    "prioritized": {**_OVER_ROLLOUT, "sampler": "prioritized"},
+    "gradient-norm": {**_OVER_ROLLOUT, "sampler": "gradient-norm"},
+    "delight": {**_OVER_ROLLOUT, "loss_weight": "delight"},
+    "kondo": {**_OVER_ROLLOUT, "sampler": "kondo", "selection_losses": "policy"},
+    "sample-dropout": {**_PPO, "loss_weight": "sample-dropout"},
+    "espo": {**_PPO, "objective": "unclipped", "stop": "espo"},
+    "target-kl": {**_PPO, "stop": "target-kl"},
+    "spo": {**_PPO, "objective": "spo"},
+    "positive": {**_PPO, "advantage_sign": "positive"},
+    "recompute": {**_PPO, "recompute_advantages": True},
+    "avec": {**_PPO, "critic": "avec", "clip_value": False},
+    "merl": {"filter": "none", "vex_target": "sample", "auxiliary": "next-observation"},
+    "pods": {**_OVER_ROLLOUT, "sampler": "pods"},
+    "vex-oracle": {**_OVER_ROLLOUT, "sampler": "vex-oracle"},
+}
+# Controls follow the rule that they are joined to: `gigaflow+random`.
+CONTROLS = ("random", "stride", "low-advantage", "reversed")
+
 ARM_HELP = {
     "ppo": "PPO (or A2C) alone: no Vex loss, nothing dropped",
     "vex-head": "the Vex head is trained, nothing is dropped",
@@ -109,13 +136,85 @@ ARM_HELP = {
     "sauna": "the corrected method: every state has its own Vex target",
     "sauna-paper": "the method as the paper states it",
     "sauna-reference": "the method as the authors' released code does it, quirks included",
+    "gigaflow": "rollout: drop samples far below the running largest |advantage|",
+    "top-advantage": "rollout: keep the half of largest |advantage|",
+    "prioritized": "rollout: draw minibatches by |advantage|, weighted back",
+    "gradient-norm": "rollout: draw minibatches by the norm of the gradient at the policy head",
+    "delight": "loss: weigh a sample by advantage times surprisal",
+    "kondo": "rollout: the policy learns from the 30% of largest advantage times surprisal",
+    "sample-dropout": "loss: leave out policy terms whose ratio has gone far from 1",
+    "espo": "stop: no clip; stop once the mean |ratio - 1| is 0.25",
+    "target-kl": "stop: stop once the KL divergence is 1.5 times 0.02",
+    "spo": "loss: a penalty on the ratio in place of the clip",
+    "positive": "loss: learn from max(0, advantage) alone",
+    "recompute": "epoch: advantages anew before each epoch",
+    "avec": "critic: fit the variance of the error instead of its square",
+    "merl": "critic: heads for the explained variance and the next observation are trained along",
+    "pods": "rollout: the half of the 64-step segments whose advantages vary most",
+    "vex-oracle": "rollout: keep where SAUNA's quantity, known afterwards, is high",
+}
+STAGES = ("collect", "rollout", "epoch", "loss", "stop", "critic")
+# What `sauna list rules` shows: `stage: sentence`.
+RULE_HELP = {
+    "sauna": "collect: keep a step if its predicted explained variance is informative (eq. 7)",
+    **{
+        name: text for name, text in ARM_HELP.items() if ": " in text and not name.startswith("ppo")
+    },
+}
+CONTROL_HELP = {
+    "random": "control: as many samples as the rule takes in each iteration, at random",
+    "stride": "control: as many, every k-th",
+    "low-advantage": "control: as many, those of smallest |advantage|",
+    "reversed": "control: as many, those that the rule wants least",
+}
+
+FILTER_HELP = {
+    "none": "keep everything",
+    "sauna": "keep where |Vex| / |median of earlier Vex| reaches the threshold (eq. 7)",
+    "random-drop": "drop at random at a given rate",
+}
+TARGET_HELP = {
+    "rollout": "eq. 5 over one actor's rollout, one number for all its states (the paper)",
+    "minibatch": "1 - Var(R - V) / Var(R) over each minibatch (the released code)",
+    "episode": "eq. 5 over each segment of one episode",
+    "sample": "each state's own share of eq. 5",
 }
 
 # The arms of a comparison where none are named; the first is the baseline.
 COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+COMPARED_SEEDS = 6
 
-# Settings that a study or a comparison decides itself.
-DECIDED = ("env", "out", "processes", "drop_rate_from", "tensorboard", "distributed")
+
+def arm_settings(arm: str) -> dict[str, Any]:
+    """The settings of an arm, or of several rules joined by `+`: `sauna+avec`, `gigaflow+random`.
+
+    A part of a joined arm adds what it changes of `ppo`; the last part may be a control.
+
+    Raises:
+      BadInput: an unknown name (naming the nearest), or two parts that want different things.
+    """
+    first, *others = arm.split("+")
+    settings = dict(_part(first))
+    changed = {name for name, value in settings.items() if ARMS["ppo"].get(name) != value}
+    for part in others:
+        added = {"control": part} if part in CONTROLS else _part(part)
+        for name, value in added.items():
+            if ARMS["ppo"].get(name) == value:
+                continue
+            if name in changed and settings[name] != value:
+                raise BadInput(f"arm: {arm} joins {name} {settings[name]} and {name} {value}")
+            settings[name] = value
+            changed.add(name)
+    return settings
+
+
+def _part(name: str) -> Mapping[str, Any]:
+    if name in CONTROLS:
+        raise BadInput(f"arm: {name} follows a rule; join it to one, such as gigaflow+{name}")
+    if name not in ARMS:
+        raise BadInput(f"unknown arm {name!r} (known: {', '.join(ARMS)}){nearest(name, ARMS)}")
+    return ARMS[name]
+
 
 # What makes an arm what its name says; the user's own values do not apply to these.
 FIXED: dict[str, tuple[str, ...]] = {
@@ -123,40 +222,6 @@ FIXED: dict[str, tuple[str, ...]] = {
     "vex-head": ("filter",),
     "random-drop": ("filter",),
 }
-
-# Rules of the experiment rather than of the filter: an unfiltered arm that shares a filtered one's
-# program takes them over, and so does a coin that repeats its drop rates: only the filter differs.
-SHARED_RULES = (
-    "vex_target",
-    "filter",
-    "threshold_schedule",
-    "keep_rate_target",
-    "history",
-    "decision",
-    "dropped",
-    "max_env_steps_factor",
-    "gae_over",
-    "truncation",
-    "budget",
-)
-
-
-# Fields that `resume` may change: they do not touch what is computed, or only its rounding where
-# another number of devices computes it.
-RESUMABLE = (
-    "processes",
-    "env_processes",
-    "env_timeout",
-    "backend",
-    "device",
-    "devices",
-    "distributed",
-    "checkpoint_every",
-    "keep_checkpoints",
-    "tensorboard",
-)
-# Fields of a stored config that the environment or the place of the run decided.
-SETTLED = ("out", "network", "normalize_observations")
 
 
 class Member(NamedTuple):
@@ -168,54 +233,74 @@ class Member(NamedTuple):
     config: Config
 
 
-def resolve(given: Mapping[str, Any]) -> Config:
-    """The config of a run: defaults < preset < arm < what the user gave.
+class RunConfig(NamedTuple):
+    """The settings of a run, resolved.
+
+    Attributes:
+      config: what the program of all members is compiled from.
+      arms: each arm's config, which differs from it in values that are traced.
+    """
+
+    config: Config
+    arms: dict[str, Config]
+
+    @property
+    def members(self) -> list[Member]:
+        """Lists all members, arm by arm and seed by seed; each with its own arm's config."""
+        return [
+            Member(f"{arm}/{seed}", arm, seed, self.arms[arm])
+            for arm in self.config.arm
+            for seed in self.config.seeds
+        ]
+
+    def replace(self, **changes: Any) -> RunConfig:
+        """Changes settings of the program and of all arms."""
+        arms = {arm: dataclasses.replace(own, **changes) for arm, own in self.arms.items()}
+        return RunConfig(dataclasses.replace(self.config, **changes), arms)
+
+
+def resolve(overrides: Mapping[str, Any]) -> Config:
+    """Resolves the config that all members of a run share; see `resolve_run`."""
+    return resolve_run(overrides).config
+
+
+def resolve_run(overrides: Mapping[str, Any]) -> RunConfig:
+    """Resolves a run: defaults < preset < arm < what the user gives.
 
     With several arms, the program-shaping values are those of the arm that filters.
 
     Raises:
       BadInput: an unknown key, arm or preset (naming the nearest), or impossible values.
     """
-    parsed = parse_all(given)
+    parsed = parse_all(overrides)
     arms = parsed.get("arm", FIELDS["arm"].default)
     _check_arms(arms, parsed)
-    configs = [arm_config(arm, parsed) for arm in arms]
-    check_read(configs, parsed)
-    shared = next((config for config in configs if config.filter != "none"), configs[0])
-    for arm, config in zip(arms, configs, strict=True):
+    configs = {arm: arm_config(arm, parsed) for arm in arms}
+    check_read(list(configs.values()), parsed)
+    shared = _shared(configs)
+    for arm, config in configs.items():
         _check_same_program(arm, config, shared)
     check_consistent(shared)
-    return shared
+    return RunConfig(shared, {arm: _member_config(own, shared) for arm, own in configs.items()})
 
 
-def members(config: Config, given: Mapping[str, Any]) -> list[Member]:
-    """All members of a run, arm by arm and seed by seed; each with its own arm's config."""
-    parsed = parse_all(given)
-    return [
-        Member(f"{arm}/{seed}", arm, seed, _member_config(arm, parsed, config))
-        for arm in config.arm
-        for seed in config.seeds
-    ]
-
-
-def parse_all(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Each given value as its field's type.
+def parse_all(overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Reads each value as its field's type.
 
     Raises:
       BadInput: an unknown key, or a value that cannot be read.
     """
-    for name in given:
+    for name in overrides:
         if name not in FIELDS:
-            raise BadInput(f"unknown key {name!r}{nearest(name, FIELDS)}")
-    return {name: parse(name, value) for name, value in given.items()}
+            raise BadInput(f"unknown key {name!r}{key_hint(name)}")
+    return {name: parse(name, value) for name, value in overrides.items()}
 
 
 def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
     if not arms or len(set(arms)) != len(arms):
         raise BadInput("arm: give each arm once, and at least one")
     for arm in arms:
-        if arm not in ARMS:
-            raise BadInput(f"unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
+        arm_settings(arm)
     chosen_preset(parsed)
     for name in parsed:
         if all(name in FIXED.get(arm, ()) for arm in arms):
@@ -223,7 +308,7 @@ def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
 
 
 def chosen_preset(parsed: Mapping[str, Any]) -> str:
-    """The preset that is named, or the first one of the algorithm.
+    """Names the preset that is given, or the first one of the algorithm.
 
     Raises:
       BadInput: there is no such preset, or it is another algorithm's than the one named.
@@ -240,85 +325,71 @@ def chosen_preset(parsed: Mapping[str, Any]) -> str:
 
 
 def algorithm_of(preset: str) -> str:
-    """The algorithm that a preset is for."""
+    """Names the algorithm that a preset is for."""
     return str(PRESETS[preset].get("algorithm", Config.algorithm))
 
 
 def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
-    """Defaults < preset < arm < what the user gave and the arm does not fix; not checked."""
+    """Layers defaults < preset < arm < what the user gives and the arm does not fix; unchecked."""
     preset = chosen_preset(parsed)
-    own = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
-    settings = {**PRESETS[preset], **ARMS[arm], **own, "preset": preset}
+    free = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
+    settings = {**PRESETS[preset], **arm_settings(arm), **free, "preset": preset}
     return dataclasses.replace(Config(), **settings)
 
 
-def _member_config(arm: str, parsed: Mapping[str, Any], shared: Config) -> Config:
-    """An arm's own traced values on the shared program; filter off is threshold 0."""
-    own = arm_config(arm, parsed)
-    off = own.filter == "none" and shared.filter != "none"
-    rules = {name: getattr(shared, name) for name in SHARED_RULES}
-    return dataclasses.replace(own, **rules, threshold=0.0 if off else own.threshold)
+def _shared(configs: Mapping[str, Config]) -> Config:
+    """Chooses the config that shapes the program: the first that filters, else the first."""
+    every = list(configs.values())
+    return next((config for config in every if config.filter != "none"), every[0])
+
+
+def _member_config(config: Config, shared: Config) -> Config:
+    """Puts an arm's traced values on the shared program; filter off is threshold 0."""
+    off = config.filter == "none" and shared.filter != "none"
+    rules = {name: getattr(shared, name) for name in fields_with("rule_of_experiment")}
+    return dataclasses.replace(config, **rules, threshold=0.0 if off else config.threshold)
 
 
 def _check_same_program(arm: str, config: Config, shared: Config) -> None:
-    if config.filter == "none" and shared.filter in ("none", "sauna"):
-        return
-    for name, field in FIELDS.items():
-        if field.metadata["shapes_program"] and getattr(config, name) != getattr(shared, name):
+    follows = config.filter == "none" and shared.filter in ("none", "sauna")
+    free = fields_with("rule_of_experiment") if follows else ()
+    for name in (name for name in fields_with("shapes_program") if name not in free):
+        if getattr(config, name) != getattr(shared, name):
             raise BadInput(
                 f"arm: {arm} differs from the other arms in {name}, which shapes the compiled "
                 f"program; train it in a run of its own"
             )
 
 
-def stored_config(stored: Mapping[str, Any]) -> Config:
-    """The config that `config.to_json` wrote, perhaps before some fields existed.
-
-    A field that is missing has its default: whoever adds one sees to it that its default is what
-    was done before.
-
-    Raises:
-      BadInput: a key is unknown, or a value cannot be read.
-    """
-    return Config(**parse_all(stored))
-
-
-def given_by(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a user has to give to get the `stored` config again, knowing what was `given` then.
-
-    A value edited in the stored config, or whose default has changed since, is given explicitly.
-    The run directory is left out, as a new run takes a new one, and the number of processes that
-    the machine decided.
-    """
-    drift = {name: value for name, value in _drifted(stored, given).items() if name != "processes"}
-    return {name: value for name, value in {**given, **drift}.items() if name != "out"}
-
-
-def as_began(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """What was `given`, and what a preset or a default gave then and does not give today.
-
-    Members take their own values from it; `stored` is the config that the run began with.
-    """
-    drift = _drifted({**to_json(Config()), **stored}, given)
-    kept = {name: value for name, value in drift.items() if name not in (*RESUMABLE, *SETTLED)}
-    return {**given, **kept}
-
-
-def _drifted(stored: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """What of the `stored` config is not what `given` comes to today."""
-    resolved = to_json(resolve(given))
-    return {
-        name: value
-        for name, value in stored.items()
-        if name not in resolved or resolved[name] != value
-    }
-
-
-def plain(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a user gave, as JSON values; `None` is not given.
+def plain(overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes what a user gives as JSON values; `None` is not given.
 
     Raises:
       BadInput: an unknown key, or a value that cannot be read.
     """
-    parsed = parse_all({name: value for name, value in given.items() if value is not None})
+    parsed = parse_all({name: value for name, value in overrides.items() if value is not None})
     return {name: list(v) if isinstance(v, tuple) else v for name, v in parsed.items()}
+
+
+def overrides_of(run: RunConfig) -> dict[str, Any]:
+    """Lists what a user has to give to get this run again, whatever is the default today.
+
+    Its directory is left out, as a new run takes a new one, and the number of processes, which the
+    machine may have decided and which changes no result.
+
+    Raises:
+      BadInput: there is no such arm or preset any more.
+    """
+    named = {name: getattr(run.config, name) for name in ("arm", "preset", "algorithm")}
+    _check_arms(run.config.arm, named)
+    usual = {arm: arm_config(arm, named) for arm in run.config.arm}
+    shared = _shared(usual)
+    found = dict(named)
+    for arm, config in run.arms.items():
+        today = _member_config(usual[arm], shared)
+        for name in FIELDS:
+            value = getattr(config, name)
+            fixed = name in FIXED.get(arm, ()) or not is_read(name, config)
+            if value != getattr(today, name) and not fixed and name not in ("out", "processes"):
+                found[name] = value
+    return plain(found)

@@ -19,11 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.plugins import is_local
+from sauna.config.settings import fields_with
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.safe_read import read_file
 from sauna.system.safe_write import open_new, sync_folder
 
-FIELDS = ("env", "tasks", "network", "filter", "vex_target", "measure")  # that may name code
+FIELDS = (*fields_with("plugin"), "tasks", "measure")  # that may name code
 # Ids of Gymnasium whose arguments name an environment of another library.
 WRAPPERS = ("GymV21Environment", "GymV26Environment")
 KEY_BYTES = 32

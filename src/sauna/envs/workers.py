@@ -49,7 +49,7 @@ class ProcessEnvs(HostEnvs):
         for worker, part in zip(self._workers, self._parts, strict=True):
             chosen = [list(seeds[i]) for i in part]
             try:
-                worker.say(
+                worker.send(
                     {
                         "kind": "make",
                         "env": env,
@@ -102,7 +102,7 @@ class ProcessEnvs(HostEnvs):
         self, number: int, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None
     ) -> None:
         try:
-            self._workers[number].say(header, arrays)
+            self._workers[number].send(header, arrays)
         except BrokenPipeError:
             self._answer(number)  # reads its last words, or names its end
 

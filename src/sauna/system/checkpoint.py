@@ -23,21 +23,22 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from sauna.system.errors import SaunaError
+from sauna.system.migrations import with_arms
 from sauna.system.safe_read import JSON_BYTES, Untrusted, check_tensors, parse_object, read_file
 from sauna.system.safe_write import own_folder, sync_folder, write_durably
 
-FORMAT = 1
+FORMAT = 2
 LARGEST = 2**34  # bytes of a state that are read at most
 # How a manifest of an older format becomes one of the next, by the older one's number.
-MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
-# What a manifest holds; the last six are a run's.
+MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {1: with_arms}
+# What a manifest holds; the last six are of a run.
 TYPES = {
     "format": int,
     "iteration": int,
     "sha256": str,
     "bytes": int,
     "config": dict,
-    "given": dict,
+    "arms": dict,
     "spaces": list,
     "members": list,
     "logs": dict,
@@ -201,7 +202,7 @@ def _manifest(path: Path) -> dict[str, Any]:
     if type(number) is not int or (number != FORMAT and number not in MIGRATIONS):
         raise Untrusted(f"not a checkpoint of format {FORMAT}")
     while number < FORMAT:
-        stored, number = MIGRATIONS[number](stored), number + 1
+        stored, number = {**MIGRATIONS[number](stored), "format": number + 1}, number + 1
     _check_types(stored)
     if path.name != f"{stored['iteration']:08d}":
         raise Untrusted(f"holds iteration {stored['iteration']}")

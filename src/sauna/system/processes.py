@@ -34,12 +34,17 @@ def send(
     header: dict[str, Any],
     arrays: dict[str, np.ndarray] | None = None,
 ) -> None:
+    """Sends a message; blocks while the pipe is full.
+
+    Raises:
+      OSError: the other side is gone.
+    """
     contiguous = {name: np.asarray(a, order="C") for name, a in (arrays or {}).items()}
     connection.send_bytes(save(contiguous, {"header": json.dumps(header)}))
 
 
 def receive(connection: Connection) -> Message:
-    """The next message.
+    """Waits for the next message.
 
     Raises:
       EOFError: the other side is gone.
@@ -48,6 +53,7 @@ def receive(connection: Connection) -> Message:
 
 
 def decode(blob: bytes) -> Message:
+    """Reads a message's bytes."""
     size = int.from_bytes(blob[:8], "little")
     metadata = json.loads(blob[8 : 8 + size])["__metadata__"]
     return Message(json.loads(metadata["header"]), load(blob))
@@ -65,7 +71,7 @@ class Shared:
 
 
 class ThreadProcess:
-    """A thread with as much of a process's face as `Worker` needs."""
+    """A thread with as much of a process's interface as `Worker` needs."""
 
     pid = os.getpid()
 
@@ -80,21 +86,21 @@ class ThreadProcess:
         return 0
 
     def kill(self) -> None:
-        """A thread cannot be killed; its closed inbox ends it at its next iteration."""
+        """Does nothing: its closed inbox ends a thread at its next iteration."""
 
 
 class Worker(NamedTuple):
     """A child process and the two ends of its pipes."""
 
     process: subprocess.Popen[bytes] | ThreadProcess
-    inbox: Connection  # what the worker says
-    outbox: Connection  # what it is told
+    inbox: Connection  # messages from the worker
+    outbox: Connection  # messages to it
 
-    def say(self, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
+    def send(self, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None) -> None:
         send(self.outbox, header, arrays)
 
     def stop(self, seconds: float = 5.0) -> None:
-        """Closes its inbox, which ends it; kills it where that is not enough."""
+        """Closes its inbox, which ends it; kills it if that is not enough."""
         self.outbox.close()
         try:
             self.process.wait(seconds)
@@ -126,7 +132,7 @@ def start_worker(module: str, environment: dict[str, str]) -> Worker:
 
 
 def start_thread(serve: Callable[[Connection, Connection], None]) -> Worker:
-    """The same in a thread of this process, for objects that another one could not import."""
+    """Starts a worker as a thread of this process, for objects that another could not import."""
     to_thread_read, to_thread_write = os.pipe()
     to_us_read, to_us_write = os.pipe()
     inbox = Connection(to_thread_read, writable=False)
@@ -143,10 +149,10 @@ def start_thread(serve: Callable[[Connection, Connection], None]) -> Worker:
 
 
 def child_ends(arguments: list[str]) -> tuple[Connection, Connection]:
-    """In the child: `(inbox, outbox)` from its command line.
+    """Opens `(inbox, outbox)` in the child, from its command line.
 
     Signals are the parent's business (schedulers send them to every process): a child ends when
-    its inbox closes, and is killed with its parent where it cannot notice that.
+    its inbox closes, and is killed with its parent if it cannot notice that.
     """
     _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -158,7 +164,7 @@ def child_ends(arguments: list[str]) -> tuple[Connection, Connection]:
 
 
 def _die_with_parent() -> None:
-    """Linux kills this process when its parent ends in any way, even where an environment hangs."""
+    """Lets Linux kill this process when its parent ends, even while an environment hangs."""
     try:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
     except (OSError, AttributeError):

@@ -1,6 +1,6 @@
 """The run directory: what is in it, who may write to it, and how its logs are cut back.
 
-config.json     every resolved value, versions, git revision, machine
+config.json     the settings and what each arm differs in, versions, git revision, machine
 failure.txt     the traceback of what ended it last, if something did
 metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
@@ -15,9 +15,11 @@ import contextlib
 import datetime
 import fcntl
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
+import shlex
 import subprocess
 import time
 from collections.abc import Mapping
@@ -42,25 +44,56 @@ _PARTS: dict[str, type] = {
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
-def default_path(env: str, arms: tuple[str, ...]) -> Path:
-    """`runs/ENV_ARMS_TIME`, a new name each second."""
+def create_default(env: str, arms: tuple[str, ...], seeds: tuple[int, ...]) -> Path:
+    """Makes `runs/ENV_ARMS_SEEDS_TIME`; two runs never get the same one.
+
+    A folder that is there already, say of a run that began in the same second, is left alone:
+    the name then ends in `-2`, `-3` and so on.
+
+    Raises:
+      BadInput: it cannot be made.
+    """
     now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    name = f"{env}_{'+'.join(arms)}_{now}".replace("/", "-").replace(":", "-")
-    return Path("runs") / name
+    name = f"{env}_{'+'.join(arms)}_{_seeds_name(seeds)}_{now}"
+    stem = name.replace("/", "-").replace(":", "-")
+    for number in itertools.count(1):
+        path = Path("runs") / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            create(path, new=True)
+            return path
+        except FileExistsError:
+            continue
+    raise AssertionError("unreachable")
 
 
-def create(path: Path) -> None:
+def _seeds_name(seeds: tuple[int, ...]) -> str:
+    if len(seeds) == 1:
+        return f"seed{seeds[0]}"
+    if seeds == tuple(range(seeds[0], seeds[-1] + 1)):
+        return f"seeds{seeds[0]}-{seeds[-1]}"
+    return f"{len(seeds)}seeds"
+
+
+def create(path: Path, new: bool = False) -> None:
     """Makes an empty run directory.
 
     Raises:
       BadInput: it holds something already, or cannot be made.
+      FileExistsError: with `new`, it is there.
     """
+    if new and path.exists():
+        raise FileExistsError(path)
     if path.exists() and (not path.is_dir() or any(map(_counts, path.iterdir()))):
-        hint = f"; `sauna resume {path}` continues it" if (path / "config.json").exists() else ""
+        again = f"; `sauna resume {shlex.quote(str(path))}` continues it"
+        hint = again if (path / "config.json").exists() else ""
         raise BadInput(f"out: {path} is not empty{hint}")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(parents=True, exist_ok=not new)
+    except FileExistsError:
+        if new and path.is_dir():
+            raise
+        raise BadInput(f"out: cannot make {path}: {path.parent} is no folder") from None
     except OSError as error:
         raise BadInput(f"out: cannot make {path}: {error.strerror}") from error
     for folder in made:
@@ -163,7 +196,7 @@ def with_code(stored: Mapping[str, Any], code: Mapping[str, str]) -> dict[str, A
 
 
 def read_config_file(path: Path) -> dict[str, Any]:
-    """A file as `config.json` is: `config` and `given`, or plain settings.
+    """Reads a file as `config.json` is: `config` and `arms`, or plain settings.
 
     Raises:
       BadInput: the file cannot be read as that.

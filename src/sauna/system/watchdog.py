@@ -1,7 +1,7 @@
-"""Whether training processes still give signs of life.
+"""Whether training processes still send heartbeats.
 
-A process that was stopped, or hangs so badly that none of its threads runs, says nothing: not even
-that it has ended. It is killed after `SILENCE`, so that a read which waits for it ends, too. An
+A process that was stopped, or hangs so badly that none of its threads runs, sends nothing: not even
+that it has ended. It is killed after `MAX_SILENCE`, so that a read which waits for it ends, too. An
 environment that hangs in the training process itself is no such case (its other threads go on);
 with `env_processes` it has a deadline of its own.
 """
@@ -15,14 +15,14 @@ from contextlib import contextmanager
 
 from sauna.system.processes import ThreadProcess, Worker
 
-SILENCE = 300.0  # seconds without a sign of life; a library may well hold the GIL for a minute
-TURN = 0.5
+MAX_SILENCE = 300.0  # seconds without a message; a library may well hold the GIL for a minute
+INTERVAL = 0.5  # seconds between two looks at the clock
 
 
-class Watch:
+class Watchdog:
     """Counts each process's silence, but only while we listen.
 
-    Time is counted in turns of our own thread: where the whole machine was suspended, or this
+    Time is counted in intervals of our own thread: if the whole machine was suspended, or this
     process was stopped together with its workers, none has passed.
     """
 
@@ -36,24 +36,27 @@ class Watch:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
+        """Counts silence while the caller waits for messages."""
         self._listening = True
         try:
             yield
         finally:
             self._listening = False
 
-    def heard(self, number: int) -> None:
+    def heartbeat(self, number: int) -> None:
+        """Notes a message of process `number`."""
         self._silent[number] = 0.0
 
     def close(self) -> None:
+        """Ends the thread."""
         self._closed.set()
 
     def _run(self) -> None:
         before = time.monotonic()
-        while not self._closed.wait(TURN):
+        while not self._closed.wait(INTERVAL):
             now = time.monotonic()
             if self._listening:
-                self._count(min(now - before, 2 * TURN))
+                self._count(min(now - before, 2 * INTERVAL))
             before = now
 
     def _count(self, seconds: float) -> None:
@@ -61,6 +64,6 @@ class Watch:
             if isinstance(worker.process, ThreadProcess) or worker.process.poll() is not None:
                 continue
             self._silent[number] += seconds
-            if self._silent[number] > SILENCE:
+            if self._silent[number] > MAX_SILENCE:
                 self.hung.add(number)
                 worker.process.kill()

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from sauna.algorithm.learner.vex_targets import make_target
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import make_program
-from sauna.algorithm.types import Filter, Hypers
+from sauna.algorithm.types import Hypers, ScoredStep, StepFilter
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput, one_line
@@ -42,14 +42,14 @@ def _check_target(config: Config) -> None:
         else (config.rollout_steps, config.envs)
     )
     x, episode = jax.ShapeDtypeStruct(shape, jnp.float32), jax.ShapeDtypeStruct(shape, jnp.int32)
-    told = jax.eval_shape(target.target, x, x, x, episode)
-    if getattr(told, "shape", None) != shape:
+    found = jax.eval_shape(target.target, x, x, x, episode)
+    if getattr(found, "shape", None) != shape:
         raise BadInput(
-            f"vex_target: {config.vex_target} gives shape {_shape(told)} instead of {shape}"
+            f"vex_target: {config.vex_target} gives shape {_shape(found)} instead of {shape}"
         )
 
 
-def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
+def _check_filter(config: Config, spaces: Spaces, filter: StepFilter) -> None:
     number: Any = jax.ShapeDtypeStruct((), jnp.float32)
     kind = jnp.uint8 if spaces.observation_kind == "image" else jnp.float32
     seen = jax.ShapeDtypeStruct((config.envs, *spaces.observation_shape), kind)
@@ -59,7 +59,10 @@ def _check_filter(config: Config, spaces: Spaces, filter: Filter) -> None:
     key = jax.eval_shape(lambda: jax.random.key(0))
     hypers = Hypers(*[number] * len(Hypers._fields))
     before = jax.eval_shape(lambda x: x, state)
-    after, mask = jax.eval_shape(filter.keep, before, seen, vex, key, hypers)
+    width = jnp.float32 if spaces.action_kind == "continuous" else jnp.int32
+    action = jax.ShapeDtypeStruct((config.envs, spaces.action_width), width)
+    scored = ScoredStep(seen, action, vex, vex, vex)
+    after, mask = jax.eval_shape(filter.keep, before, scored, key, hypers)
     if getattr(mask, "shape", None) != (config.envs,) or mask.dtype != bool:
         raise BadInput(
             f"filter: {config.filter} gives a mask of shape {_shape(mask)} and type "
@@ -80,5 +83,5 @@ def _shape(x: Any) -> Any:
 
 
 def _may_become(before: Any, after: Any) -> bool:
-    """Whether a loop may carry both; a Python number takes the type that it is used with."""
+    """Returns whether a loop may carry both; a Python number takes the type of its use."""
     return before.shape == after.shape and (before.dtype == after.dtype or before.weak_type)

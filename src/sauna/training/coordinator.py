@@ -13,11 +13,12 @@ from collections.abc import Mapping
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sauna.config.settings import Config, local_parts, to_json
+from sauna.config.checks import local_parts
+from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.system.logs import Logs, check_logs
@@ -25,17 +26,15 @@ from sauna.system.processes import Message, Worker, receive, start_thread, start
 from sauna.system.safe_write import replace_file
 from sauna.system.signals import handled
 from sauna.system.tracebacks import cause_of
-from sauna.system.watchdog import Watch
+from sauna.system.watchdog import Watchdog
 from sauna.training.display import Display
+from sauna.training.run import Run, resume_command
 from sauna.training.tensorboard import TensorBoard
 from sauna.training.worker import serve, write_job
 
-if TYPE_CHECKING:
-    from sauna.training.run import Run
-
 LEAD = 2  # iterations that a process may be ahead of the slowest one
 SECONDS_AHEAD = 2.0  # on the device, where a call runs several: what a signal may have to wait
-MOST_AHEAD = 64
+MAX_LEAD = 64
 
 
 class Coordinator:
@@ -65,7 +64,7 @@ class Coordinator:
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
         self._workers = [self._start(part, loaded, replay) for part in self._parts]
-        self._watch = Watch(self._workers)
+        self._watchdog = Watchdog(self._workers)
 
     def _start(
         self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
@@ -82,8 +81,7 @@ class Coordinator:
             if any(key.startswith(name + "/") for name in names)
         }
         header = write_job(
-            to_json(run.config),
-            run.given,
+            run.prepared.run,
             run.spaces,
             [int(index) for index in part],
             [run.drop_rates[index] for index in part] if run.drop_rates else [],
@@ -91,7 +89,7 @@ class Coordinator:
             replay,
         )
         try:
-            worker.say(header, arrays)
+            worker.send(header, arrays)
         except BrokenPipeError:
             pass  # its end is noticed, and named, when its inbox is read
         return worker
@@ -100,13 +98,19 @@ class Coordinator:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._watch.close()
+        self._watchdog.close()
         for worker in self._workers:
             worker.stop(0.0 if error[0] else 5.0)
         self._tensorboard.close()
         self._display.close()
 
     def run(self) -> None:
+        """Trains to the end, or to where a signal stops it.
+
+        Raises:
+          Interrupted: a signal came; the state is saved.
+          SaunaError: something failed; the last good checkpoint is on disk.
+        """
         run = self._run
         self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
@@ -120,17 +124,17 @@ class Coordinator:
             raise Interrupted(
                 self._signal or 0,
                 f"stopped by {signal.Signals(self._signal or 0).name} after iteration "
-                f"{self._last_iteration()}; continue with: sauna resume {self._run.path}",
+                f"{self._last_iteration()}; continue with: {resume_command(self._run.path)}",
             )
 
     def _last_iteration(self) -> int:
         return max(end for end in self._ended if end is not None)
 
     def _on_signal(self, number: int) -> None:
-        """Only notes the first signal: it may come in the middle of anything."""
+        """Notes the first signal, and no more: it may come in the middle of anything."""
         if self._signal is not None:
             raise Interrupted(
-                number, f"stopped at once; continue with: sauna resume {self._run.path}"
+                number, f"stopped at once; continue with: {resume_command(self._run.path)}"
             )
         self._signal = number
 
@@ -139,20 +143,20 @@ class Coordinator:
         self._stopping = True
         name = signal.Signals(number).name
         self._display.say(f"{name}: finishing the iteration, then saving (again to stop at once)")
-        self._tell()
+        self._send_grant()
 
     def _grant(self) -> None:
         """Lets every worker run at most `self._lead` iterations ahead of the slowest."""
         running = [r for r, end in zip(self._reached, self._ended, strict=True) if end is None]
         if running and not self._stopping and min(running) + self._lead > self._granted:
             self._granted = min(running) + self._lead
-            self._tell()
+            self._send_grant()
 
-    def _tell(self) -> None:
+    def _send_grant(self) -> None:
         for worker, end in zip(self._workers, self._ended, strict=True):
             if end is None:
                 try:
-                    worker.say({"granted": self._granted, "stop": self._stopping})
+                    worker.send({"granted": self._granted, "stop": self._stopping})
                 except BrokenPipeError:
                     pass  # its end is noticed, and named, when its inbox is read
 
@@ -165,7 +169,7 @@ class Coordinator:
             for number, worker in enumerate(self._workers)
             if self._ended[number] is None
         }
-        with self._watch.listening():
+        with self._watchdog.listening():
             ready = wait(list(inboxes), timeout=0.1)
         for inbox in ready:
             number = inboxes[inbox]  # type: ignore[index]
@@ -175,18 +179,18 @@ class Coordinator:
     def _receive(self, number: int) -> Message:
         worker = self._workers[number]
         try:
-            with self._watch.listening():
+            with self._watchdog.listening():
                 message = receive(worker.inbox)
         except (EOFError, ConnectionResetError):
             code = worker.process.wait()
             how = f"ended with exit code {code}"
-            if number in self._watch.hung:
-                how = f"gave no sign of life for {watchdog.SILENCE:g} s and was killed"
+            if number in self._watchdog.hung:
+                how = f"sent no heartbeat for {watchdog.MAX_SILENCE:g} s and was killed"
             raise SaunaError(
                 f"training process {number} ({worker.process.pid}) {how}; the last good "
-                f"checkpoint is kept, continue with: sauna resume {self._run.path}"
+                f"checkpoint is kept, continue with: {resume_command(self._run.path)}"
             ) from None
-        self._watch.heard(number)
+        self._watchdog.heartbeat(number)
         return message
 
     def _handle(self, number: int, message: Message) -> None:
@@ -225,7 +229,7 @@ class Coordinator:
             self._save(*self._due.pop(0))
 
     def _complete(self, iteration: int, messages: Mapping[int, Message]) -> bool:
-        """Whether every process that runs this iteration has reported it."""
+        """Returns whether every process that runs this iteration has reported it."""
         return bool(messages) and all(
             number in messages or (end is not None and end <= iteration)
             for number, end in enumerate(self._ended)
@@ -238,7 +242,7 @@ class Coordinator:
         )
 
     def _save(self, iteration: int, logs: dict[str, Any]) -> None:
-        """A checkpoint of all members at (the start of) an iteration, or at their end before it."""
+        """Saves all members at (the start of) an iteration, or at their end before it."""
         arrays: dict[str, np.ndarray] = {}
         for states in self._states:
             arrays |= states[iteration if iteration in states else max(states)]
@@ -252,10 +256,10 @@ class Coordinator:
             self._run.config.keep_checkpoints,
         )
 
-    def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, float]]) -> None:
+    def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> None:
         seconds = max(timing["seconds"] for timing in timings)
         steps = sum(timing["env_steps"] for timing in timings)
-        timing = {
+        timing: dict[str, Any] = {
             "iteration": self._iteration,
             "env_steps": steps,
             "seconds": seconds,
@@ -263,6 +267,12 @@ class Coordinator:
         }
         if all("collect_seconds" in timing for timing in timings):  # unknown on the device
             timing["collect_seconds"] = max(timing["collect_seconds"] for timing in timings)
+            timing["collect_cpu_seconds"] = sum(t["collect_cpu_seconds"] for t in timings)
+            timing["update_cpu_seconds"] = {
+                member: seconds
+                for t in timings
+                for member, seconds in t["update_cpu_seconds"].items()
+            }
         self._logs.append("metrics.jsonl", rows)
         self._logs.append("timing.jsonl", [timing])
         self._tensorboard.write(rows, timing)
@@ -294,8 +304,8 @@ class Coordinator:
 
 
 def lead_for(seconds: float) -> int:
-    """Iterations to grant where one takes `seconds`: a call to the device runs many short ones."""
-    return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MOST_AHEAD))
+    """Counts the iterations to grant if one takes `seconds`: the device runs many in a call."""
+    return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MAX_LEAD))
 
 
 def _failure(run: Path, header: dict[str, Any]) -> SaunaError:
@@ -312,7 +322,7 @@ def _failure(run: Path, header: dict[str, Any]) -> SaunaError:
 
 
 def _environment(config: Config) -> dict[str, str]:
-    """What a worker's JAX has to know before it is imported."""
+    """Lists what a worker's JAX has to know before it is imported."""
     if config.backend == "device" and config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
     return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}

@@ -16,20 +16,32 @@ PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
 class Display(Protocol):
     """Where a run shows itself. `say` works before `open` and after `close`."""
 
-    def say(self, text: str) -> None: ...
+    def say(self, text: str) -> None:
+        """Shows one line of text."""
+
     def open(
         self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
     ) -> None:
-        """`rows`: those of before, of a run that is resumed."""
+        """Begins to show a run; `rows` are those of before, of a run that is resumed."""
 
-    def phase(self, process: int, text: str) -> None: ...
-    def rows(self, rows: list[dict[str, Any]]) -> None: ...
-    def refresh(self) -> None: ...
-    def summary(self, members: dict[str, dict[str, Any]]) -> None: ...
-    def close(self) -> None: ...
+    def phase(self, process: int, text: str) -> None:
+        """Notes what a process does now."""
+
+    def rows(self, rows: list[dict[str, Any]]) -> None:
+        """Takes the rows of one iteration."""
+
+    def refresh(self) -> None:
+        """Shows what is new; called often."""
+
+    def summary(self, members: dict[str, dict[str, Any]]) -> None:
+        """Shows how each member ended."""
+
+    def close(self) -> None:
+        """Ends the showing."""
 
 
 def make_display() -> Display:
+    """Makes a live table on a terminal, and plain lines elsewhere."""
     return LiveDisplay() if sys.stdout.isatty() else PlainDisplay()
 
 
@@ -59,11 +71,12 @@ class _Progress:
             self.seconds_left = left / self.rate if self.rate else None
 
     def budget_used(self, name: str) -> int:
+        """Counts the steps of a member's budget that are used."""
         row = self.latest[name]
         return row[f"{self.config.budget}_steps"] if row else 0
 
     def status(self) -> str:
-        """One line: phase or rate, time left."""
+        """Writes one line: phase or rate, time left."""
         share = sum(self.budget_used(n) for n in self.latest) / (
             self.config.steps * len(self.latest)
         )
@@ -75,12 +88,14 @@ class _Progress:
 
 
 def duration(seconds: float) -> str:
+    """Writes seconds as `h:mm:ss` or `m:ss`."""
     minutes, rest = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def number(row: dict[str, Any] | None, key: str, form: str) -> str:
+    """Formats a number of a row; `-` if it is not there."""
     return format(row[key], form) if row and key in row else "-"
 
 
@@ -200,6 +215,7 @@ class LiveDisplay:
 
 
 def headline(config: Config, members: list[Member], path: Path) -> str:
+    """Says in one line what is trained, and where it is written."""
     return (
         f"{config.env}: {len(members)} member{'s' if len(members) > 1 else ''} "
         f"({', '.join(config.arm)} x {len(config.seeds)} seeds), {config.steps:,} "

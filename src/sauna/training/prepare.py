@@ -1,17 +1,17 @@
-"""Where a run's environments are stepped: on the host or on the device, and on which."""
+"""From what a user gives to what is trained: resolved, placed, and its environment looked at."""
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sauna.config.presets import ARMS, Member, parse_all, resolve
-from sauna.config.settings import ON_DEVICE, Config, check_read, local_parts
+from sauna.config.checks import check_read, check_read_here, local_parts, own_parts
+from sauna.config.presets import Member, RunConfig, arm_settings, parse_all, resolve_run
+from sauna.config.settings import Config
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.envs.spaces import Spaces
@@ -19,30 +19,81 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
 from sauna.system.safe_read import JSON_BYTES
-from sauna.training.loop.multihost import check_shared, read_place
+from sauna.training.loop.multihost import check_split, read_host_rank
 
-MOST_STEPS = 2**31 - 1  # that the device's counters hold
+if TYPE_CHECKING:
+    from sauna.training.loop.job import Job
+
+MAX_STEPS = 2**31 - 1  # that the device's counters hold
 
 
-def placed(config: Config) -> Config:
-    """Resolves where the environments run, and on what.
+class Prepared(NamedTuple):
+    """A run that can be trained.
+
+    Attributes:
+      run: its settings, with all that depends on the machine and the environment decided.
+      spaces: of its environment.
+      differs: how two equal episodes of the environment differed; None if it repeats itself.
+    """
+
+    run: RunConfig
+    spaces: Spaces
+    differs: str | None
+
+    @property
+    def config(self) -> Config:
+        """What all members share."""
+        return self.run.config
+
+    @property
+    def members(self) -> list[Member]:
+        """What is trained, arm by arm and seed by seed."""
+        return self.run.members
+
+    def job(self, chosen: Sequence[int] | None = None, **more: Any) -> Job:
+        """Makes the `Job` of the `chosen` members (by index; None: all), from its start.
+
+        Args:
+          more: fields of `Job` that are not at their defaults.
+        """
+        from sauna.training.loop.job import Job
+
+        members = self.members
+        picked = members if chosen is None else [members[i] for i in chosen]
+        kwargs = json.loads(self.config.env_kwargs)
+        return Job(self.config, self.spaces, kwargs, picked, **{"replay": not self.differs, **more})
+
+
+def prepare(overrides: Mapping[str, Any]) -> Prepared:
+    """Prepares a run with the settings that a user gives.
+
+    Raises:
+      BadInput: the settings or the environment cannot be used.
+    """
+    return examine(place(resolve_run(overrides)), overrides)
+
+
+def place(run: RunConfig) -> RunConfig:
+    """Decides where the environments run, and on what.
 
     Raises:
       BadInput: a setting that is not read there.
     """
+    config = run.config
     if ":" in config.env and has_gpu() and not local_parts(config):
         configure_jax()  # before the user's module makes its first array, on the GPU
     if config.backend == "auto" and is_native(config.env, json.loads(config.env_kwargs)):
-        config = dataclasses.replace(config, backend="device")
+        run = run.replace(backend="device")
+        config = run.config
     if config.backend != "device":
-        return config
+        return run
     if config.env_processes:
         raise BadInput("env_processes: not read with backend device")
-    if read_place(config.distributed).machines > 1 and config.devices:
+    if read_host_rank(config.distributed).hosts > 1 and config.devices:
         raise BadInput("devices: not read with distributed, where every device takes part")
     most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
-    if most > MOST_STEPS:
-        raise BadInput(f"steps: the device counts to {MOST_STEPS}, not to {most}")
+    if most > MAX_STEPS:
+        raise BadInput(f"steps: the device counts to {MAX_STEPS}, not to {most}")
     device = config.device
     if device == "gpu" and not has_gpu():
         raise BadInput(
@@ -51,11 +102,11 @@ def placed(config: Config) -> Config:
         )
     if device == "auto":
         device = "gpu" if has_gpu() else "cpu"
-    return dataclasses.replace(config, device=device)
+    return run.replace(device=device)
 
 
 def has_gpu() -> bool:
-    """Whether there is an NVIDIA GPU and a JAX that may use it; found without importing JAX."""
+    """Finds, without importing JAX, whether there is an NVIDIA GPU that JAX may use."""
     drivers = ("/proc/driver/nvidia/version", "/usr/lib/wsl/lib/libcuda.so.1")
     plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
     hidden = os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")
@@ -68,8 +119,30 @@ def has_gpu() -> bool:
     )
 
 
+def examine(run: RunConfig, overrides: Mapping[str, Any], found: Probe | None = None) -> Prepared:
+    """Looks at the environment of a placed run, and decides what depends on it.
+
+    Args:
+      run: see `place`.
+      overrides: what the user gives, each of which something has to read.
+      found: what is known of the environment already.
+
+    Raises:
+      BadInput: the environment cannot be used, or leaves something that is given unread.
+    """
+    found = found or look_at(run.config)
+    run = _settle(run, found.spaces)
+    parsed = parse_all(overrides)
+    check_read_here(run.config, found.spaces, parsed)
+    check_read(list(run.arms.values()), parsed)
+    asked = parsed.get("processes", 0)
+    if _together(run.config) and asked > 1:
+        raise BadInput(f"processes: {asked} asked for, but all members and devices are one program")
+    return Prepared(run, found.spaces, found.differs)
+
+
 def look_at(config: Config) -> Probe:
-    """What has to be known of the environment before a run starts."""
+    """Learns what has to be known of the environment before a run starts."""
     kwargs = json.loads(config.env_kwargs)
     if config.backend != "device":
         return probe(config.env, kwargs)
@@ -80,89 +153,45 @@ def look_at(config: Config) -> Probe:
     return probe_on_device(config.env, kwargs)
 
 
-def looked_at(config: Config, given: Mapping[str, Any]) -> tuple[Config, Probe]:
-    """The config with what depends on the environment; and what was found there.
-
-    Raises:
-      BadInput: the environment cannot be used, or leaves a given field unread.
-    """
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    check_read_after_settling(found.spaces, config, given)
-    return config, found
-
-
 def check_writes(config: Config) -> None:
     """Refuses to write the run of another machine.
 
     Raises:
       BadInput: this is not machine 0.
     """
-    if read_place(config.distributed).number:
+    if read_host_rank(config.distributed).rank:
         raise BadInput(
             "distributed: machine 0 writes the run; the others follow it with "
             "`sauna train`, on the command line"
         )
 
 
-def check_read_after_settling(spaces: Spaces, config: Config, given: Mapping[str, Any]) -> None:
-    """Refuses what the environment's spaces leave unread.
-
-    Raises:
-      BadInput: naming the field.
-    """
-    _check_placement(config, given)
-    names = ("hidden", "activation", "clip_observations")
-    check_read([config], {name: given[name] for name in names if name in given})
-    if "log_std_init" in given and spaces.action_kind != "continuous":
-        raise BadInput(f"log_std_init: not read with {spaces.action_kind} actions")
-    wanted = "normalize_observations" in given and resolve(given).normalize_observations
-    if wanted and not config.normalize_observations:
-        raise BadInput(
-            f"normalize_observations: {spaces.observation_kind} observations have "
-            f"no running moments"
-        )
-
-
-def _check_placement(config: Config, given: Mapping[str, Any]) -> None:
-    """Refuses what the place of the environments leaves unread.
-
-    Raises:
-      BadInput: naming the field.
-    """
-    for name in given:
-        if name in ON_DEVICE and config.backend != "device":
-            raise BadInput(f"{name}: only read with backend device")
-    asked = parse_all(given).get("processes", 0)
-    if _together(config) and asked > 1:
-        raise BadInput(f"processes: {asked} asked for, but all members and devices are one program")
-
-
 def _together(config: Config) -> bool:
-    """Whether one program trains all members, on a GPU or on several devices."""
+    """Returns whether one program trains all members, on a GPU or on several devices."""
     several = config.device == "gpu" or config.devices > 1 or bool(config.distributed)
     return config.backend == "device" and several
 
 
-def check_own_parts(config: Config, spaces: Spaces) -> None:
+def check_own_parts(prepared: Prepared) -> None:
     """Looks at what of a run is the user's own: a mistake there is bad input.
 
     Raises:
       BadInput: a part cannot be used.
     """
-    if any(":" in name for name in (config.network, config.filter, config.vex_target)):
+    if own_parts(prepared.config):
         configure_jax()
         from sauna.training.check_plugins import check_plugins
 
-        check_plugins(config, spaces)
+        check_plugins(prepared.config, prepared.spaces)
 
 
-def settle(config: Config, spaces: Spaces) -> Config:
+def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
     """Replaces what depends on the environment or the machine by what it comes to.
 
     Raises:
       BadInput: the network does not fit the observations.
     """
+    config = run.config
     image = spaces.observation_kind == "image"
     network = config.network
     if network == "auto":
@@ -172,14 +201,13 @@ def settle(config: Config, spaces: Spaces) -> Config:
             f"network: {network} does not fit {spaces.observation_kind} observations of shape "
             f"{spaces.observation_shape}"
         )
-    number = len(config.arm) * len(config.seeds)
+    number = len(run.members)
     processes = config.processes or os.cpu_count() or 1
     if config.backend == "device" and config.devices > 1:
-        check_shared("devices", number, config.envs, config.devices)
+        check_split("devices", number, config.envs, config.devices)
     if _together(config):
         processes = 1
-    return dataclasses.replace(
-        config,
+    return run.replace(
         network=network,
         normalize_observations=config.normalize_observations
         and spaces.observation_kind == "vector",
@@ -188,7 +216,7 @@ def settle(config: Config, spaces: Spaces) -> Config:
 
 
 def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
-    """Per member, the drop rate that the run it repeats had in every iteration.
+    """Reads, per member, the drop rate that the run it repeats had in every iteration.
 
     Raises:
       BadInput: that run is not complete, lacks a seed, is not of exactly one filtered arm, or has
@@ -198,7 +226,7 @@ def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
     if not source:
         return []
     arms = run_directory.read_config(Path(source))["config"]["arm"]
-    filtered = [arm for arm in arms if ARMS[arm]["filter"] != "none"]
+    filtered = [arm for arm in arms if arm_settings(arm)["filter"] != "none"]
     if len(filtered) != 1:
         raise BadInput(f"drop_rate_from: {source} has {len(filtered)} filtered arms; it needs one")
     if not run_directory.is_complete(Path(source)):

@@ -6,71 +6,78 @@ once, and the training itself happens in the workers that `coordinator.py` start
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from sauna.config.checks import check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
-from sauna.config.presets import (
-    RESUMABLE,
-    Member,
-    _check_arms,
-    as_began,
-    members,
-    plain,
-    resolve,
-    stored_config,
-)
-from sauna.config.settings import Config, check_consistent, local_parts, to_json
+from sauna.config.parsing import many_seeds
+from sauna.config.presets import Member, parse_all, plain, resolve_run
+from sauna.config.settings import Config, fields_with
+from sauna.config.stored import read_stored, to_stored
 from sauna.config.trust import check_trusted, seal
-from sauna.envs.probe import Probe
-from sauna.envs.spaces import difference, read_spaces
+from sauna.envs.spaces import Spaces, difference, read_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
 from sauna.system.working_folder import kept_folder
 from sauna.training.display import Display
-from sauna.training.loop.multihost import Follower, join, read_place
+from sauna.training.loop.multihost import Follower, join, read_host_rank
 from sauna.training.prepare import (
-    _check_placement,
+    Prepared,
     check_own_parts,
     check_writes,
     drop_rates_of,
-    look_at,
-    looked_at,
-    placed,
-    settle,
+    examine,
+    place,
 )
 from sauna.training.tensorboard import TensorBoard
 
 
 class Run:
-    """One run on disk, ready to be trained further."""
+    """One run on disk, ready to be trained further.
+
+    Attributes:
+      path: its directory, which this process has locked until `lock` is closed.
+      prepared: its settings and what is known of its environment.
+      drop_rates: of each member and iteration; empty: the config's constant one.
+      made: whether the directory was made by this object's maker.
+    """
 
     def __init__(
-        self,
-        path: Path,
-        given: dict[str, Any],
-        config: Config,
-        found: Probe,
-        drop_rates: list[list[float]],
-        made: bool = False,
+        self, path: Path, prepared: Prepared, drop_rates: list[list[float]], made: bool = False
     ) -> None:
-        self.path, self.given, self.config = path, given, config
-        self.made = made  # the directory, by us
-        self.spaces, self.differs = found
-        self.members: list[Member] = members(config, given)
-        self.drop_rates = drop_rates
-        self.code = code_of(to_json(config))
-        self.held: IO[str] = run_directory.lock(path)
+        self.path, self.prepared, self.drop_rates, self.made = path, prepared, drop_rates, made
+        self.code = code_of(to_stored(prepared.run))
+        self.lock: IO[str] = run_directory.lock(path)
+
+    @property
+    def config(self) -> Config:
+        """What all members share."""
+        return self.prepared.config
+
+    @property
+    def members(self) -> list[Member]:
+        """What is trained, arm by arm and seed by seed."""
+        return self.prepared.members
+
+    @property
+    def spaces(self) -> Spaces:
+        """Of the environment."""
+        return self.prepared.spaces
+
+    @property
+    def differs(self) -> str | None:
+        """How two equal episodes differed; None if the environment repeats itself."""
+        return self.prepared.differs
 
     def manifest(self) -> dict[str, Any]:
+        """Says what a checkpoint of this run is of."""
         return {
-            "config": to_json(self.config),
-            "given": self.given,
+            **to_stored(self.prepared.run),
             "spaces": list(self.spaces),
             "members": [member.name for member in self.members],
             "versions": run_directory.versions(),
@@ -78,47 +85,68 @@ class Run:
         }
 
 
-@kept_folder()
-def start(given: Mapping[str, Any], display: Display) -> Run:
-    """A new run: everything is checked before anything is created.
+def start(overrides: Mapping[str, Any], display: Display) -> Run:
+    """Starts a new run: everything is checked before anything is created.
 
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
     """
-    here = Path.cwd()  # an environment may go elsewhere
-    given = plain(given)
-    config = placed(resolve(given))
-    check_writes(config)
-    config, found = looked_at(config, given)
-    drop_rates = drop_rates_of(members(config, given))
-    TensorBoard.check(config)
-    check_own_parts(config, found.spaces)
-    path = Path(config.out) if config.out else run_directory.default_path(config.env, config.arm)
-    config, path = dataclasses.replace(config, out=str(path)), here / path
+    with kept_folder():  # an environment may go elsewhere
+        overrides = plain(overrides)
+        placed = place(resolve_run(overrides))
+        check_writes(placed.config)
+        prepared = examine(placed, overrides)
+        drop_rates = drop_rates_of(prepared.members)
+        TensorBoard.check(prepared.config)
+        check_own_parts(prepared)
+    path, made = _make_directory(prepared.config)
+    prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
+    path = Path.cwd() / path
     stored = {
-        "given": given,
-        "config": to_json(config),
-        "spaces": list(found.spaces),
+        **to_stored(prepared.run),
+        "spaces": list(prepared.spaces),
         "drop_rates": drop_rates,
-        "exact_resume": found.differs is None,
+        "exact_resume": prepared.differs is None,
         "versions": run_directory.versions(),
         "git": run_directory.git_revision(),
         "machine": run_directory.machine(),
     }
     stored["seal"] = seal(stored)
-    made = not path.exists()
     with disk_errors(path):
-        run_directory.create(path)
-        run = Run(path, given, config, found, drop_rates, made)
+        run = Run(path, prepared, drop_rates, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
             run_directory.write_config(path, {**stored, "code": run.code})
         except BaseException:
-            run.held.close()
+            run.lock.close()
             raise
-    if found.differs:
+    _show_notes(prepared, display)
+    return run
+
+
+def _make_directory(config: Config) -> tuple[Path, bool]:
+    """Makes the run's directory; returns it and whether it is new.
+
+    Raises:
+      BadInput: it holds something already, or cannot be made.
+    """
+    if not config.out:
+        return run_directory.create_default(config.env, config.arm, config.seeds), True
+    path = Path(config.out)
+    made = not path.exists()
+    with disk_errors(path):
+        run_directory.create(path)
+    return path, made
+
+
+def _show_notes(prepared: Prepared, display: Display) -> None:
+    """Says what a user may not expect of this run."""
+    config = prepared.config
+    if note := many_seeds(config.seeds):
+        display.say(note)
+    if prepared.differs:
         display.say(
-            f"warning: {config.env} does not repeat itself ({found.differs}): this run can be "
+            f"warning: {config.env} does not repeat itself ({prepared.differs}): this run can be "
             f"continued, but not resumed exactly"
         )
     if local_parts(config):
@@ -126,34 +154,30 @@ def start(given: Mapping[str, Any], display: Display) -> Run:
             f"note: {', '.join(local_parts(config))} cannot be imported by name: this run trains "
             f"in this process, and can be resumed only from Python, passing the same again"
         )
-    return run
 
 
-def follows(given: Mapping[str, Any]) -> bool:
-    """Whether another machine writes this run.
+def follows(overrides: Mapping[str, Any]) -> bool:
+    """Returns whether another machine writes this run.
 
     Raises:
       BadInput: `distributed` cannot be read.
     """
-    return read_place(str(given.get("distributed", ""))).number > 0
+    return read_host_rank(str(overrides.get("distributed", ""))).rank > 0
 
 
-def follow(given: Mapping[str, Any], display: Display) -> None:
+def follow(overrides: Mapping[str, Any], display: Display) -> None:
     """Trains together with the machine that writes the run, until that has finished.
 
     Raises:
       BadInput: as `start`.
     """
-    given = plain(given)
-    config = placed(resolve(given))
+    overrides = plain(overrides)
+    placed = place(resolve_run(overrides))
+    config = placed.config
     configure_jax(config.devices if config.device == "cpu" else 0, config.device)
-    join(read_place(config.distributed))  # before an environment makes its first array
-    config, found = looked_at(config, given)
-    everyone = members(config, given)
-    from sauna.training.loop.job import Job
-
-    kwargs = json.loads(config.env_kwargs)
-    job = Job(config, found.spaces, kwargs, everyone, drop_rates_of(everyone), None, 0, True)
+    join(read_host_rank(config.distributed))  # before an environment makes its first array
+    prepared = examine(placed, overrides)
+    job = prepared.job(drop_rates=drop_rates_of(prepared.members))
     from sauna.training.worker import train_members
 
     train_members(job, Follower(display.say))
@@ -167,7 +191,7 @@ def reopen(
     trust: bool = False,
     accept_changed_code: bool = False,
 ) -> Run:
-    """An existing run, to be continued; from then on it counts as this user's.
+    """Opens an existing run, to be continued; from then on it counts as this user's.
 
     Args:
       trust: the code that it names may run, even if another user named it.
@@ -180,59 +204,65 @@ def reopen(
     path = Path.cwd() / path  # an environment may go elsewhere
     stored = run_directory.read_config(path)
     check_trusted(stored, str(path), stored.get("seal"), trust)
+    resumable = fields_with("resumable")
     for name in changes:
-        if name not in RESUMABLE:
-            raise BadInput(f"{name}: cannot be changed on resume (can: {', '.join(RESUMABLE)})")
-    given = {**stored.get("given", {}), **changes}
-    resolved = resolve(given)
-    config = stored_config(stored.get("config", {}))
-    config = dataclasses.replace(config, **{name: getattr(resolved, name) for name in changes})
-    _check_arms(config.arm, {})
-    check_consistent(config)
-    TensorBoard.check(config)
-    config = placed(config)
-    check_writes(config)
-    if (config.backend == "device") != (stored["config"].get("backend") == "device"):
+        if name not in resumable:
+            raise BadInput(f"{name}: cannot be changed on resume (can: {', '.join(resumable)})")
+    before = read_stored(stored)
+    changed = before.replace(**parse_all(changes))
+    check_consistent(changed.config)
+    TensorBoard.check(changed.config)
+    changed = place(changed)
+    check_writes(changed.config)
+    if (changed.config.backend == "device") != (before.config.backend == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
-    _check_placement(config, changes)
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    try:
-        differs = difference(found.spaces, read_spaces(stored["spaces"]))
-    except (TypeError, ValueError) as error:
-        raise BadInput(f"config: {path}: its spaces cannot be read: {error}") from error
-    if differs:
-        raise BadInput(f"{config.env} has other spaces than when the run started: {differs}")
-    before = stored.get("given", {})
-    began = as_began(stored["config"], before)
-    kept = [f"{name} {value}" for name, value in began.items() if before.get(name) != value]
-    if kept:
-        display.say(f"note: this version has other values; kept from the start: {', '.join(kept)}")
+    prepared = examine(changed, changes)
+    _check_spaces(prepared, path, stored["spaces"])
     with disk_errors(path):
-        run = Run(path, {**began, **changes}, config, found, stored.get("drop_rates", []))
-    changed = changed_code(stored.get("code", run.code), run.code)
-    if changed and not accept_changed_code:
-        run.held.close()
+        run = Run(path, prepared, stored.get("drop_rates", []))
+    differs = changed_code(stored.get("code", run.code), run.code)
+    if differs and not accept_changed_code:
+        run.lock.close()
         raise BadInput(
-            f"{path} was trained with other code: {changed}; --accept-changed-code (in Python "
+            f"{path} was trained with other code: {differs}; --accept-changed-code (in Python "
             f"accept_changed_code=True) goes on with today's"
         )
     with disk_errors(path):
-        if trust or changed:
-            stored = run_directory.with_code(stored, run.code) if changed else stored
+        if trust or differs:
+            stored = run_directory.with_code(stored, run.code) if differs else stored
             run_directory.write_config(path, {**stored, "seal": seal(stored)})
     return run
 
 
+def _check_spaces(prepared: Prepared, path: Path, stored: list[Any]) -> None:
+    """Refuses an environment whose spaces a learner sees as other than the stored ones.
+
+    Raises:
+      BadInput: naming the part that differs.
+    """
+    try:
+        differs = difference(prepared.spaces, read_spaces(stored))
+    except (TypeError, ValueError) as error:
+        raise BadInput(f"config: {path}: its spaces cannot be read: {error}") from error
+    if differs:
+        env = prepared.config.env
+        raise BadInput(f"{env} has other spaces than when the run started: {differs}")
+
+
+def resume_command(path: Path) -> str:
+    """Spells the command that continues a run, for a shell."""
+    return f"sauna resume {shlex.quote(str(path))}"
+
+
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """What the system says of a file becomes one line, with what to do next."""
+    """Turns what the system says of a file into one line, with what to do next."""
     try:
         yield
     except BrokenPipeError:  # of our own output: nobody reads it any more
         raise
     except OSError as error:
-        again = "; the last good checkpoint is kept, continue with: sauna resume "
-        hint = f"{again}{path}" if (path / "config.json").exists() else ""
-        place = error.filename or path
-        raise SaunaError(f"cannot read or write {place}: {error.strerror}{hint}") from error
+        again = f"; the last good checkpoint is kept, continue with: {resume_command(path)}"
+        hint = again if (path / "config.json").exists() else ""
+        where = error.filename or path
+        raise SaunaError(f"cannot read or write {where}: {error.strerror}{hint}") from error

@@ -24,7 +24,7 @@ class TensorBoard:
         if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
             raise BadInput("tensorboard: needs `pip install sauna-rl[tensorboard]`")
 
-    def write(self, rows: list[dict[str, Any]], timing: dict[str, float]) -> None:
+    def write(self, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         if self._folder is None:
             return
         for row in rows:

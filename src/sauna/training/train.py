@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import RESUMABLE
-from sauna.config.settings import Config, to_json
+from sauna.config.settings import Config, fields_with, to_json
 from sauna.envs.spaces import difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
@@ -17,7 +17,10 @@ from sauna.training.run import Run, disk_errors
 
 
 def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> bool:
-    """Trains a run to its end; returns, when everything is written, whether there was any to do.
+    """Trains a run to its end; returns when everything is written.
+
+    Returns:
+      False if it was complete already, so that nothing was done.
 
     Raises:
       BadInput: a setting cannot be used after all, as a worker found; a new run is removed again.
@@ -34,7 +37,7 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
             run_directory.discard(run.path, run.made)
         raise
     finally:
-        run.held.close()
+        run.lock.close()
 
 
 def _train(run: Run, display: Display, resume: bool, inexact: bool) -> bool:
@@ -59,24 +62,24 @@ def _is_whole(run: Run, display: Display) -> bool:
 
 
 def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
-    """The newest checkpoint that is good, of this run, and whose rows are all there.
+    """Loads the newest checkpoint that is good, of this run, and whose rows are all there.
 
     Raises:
       BadInput: a checkpoint is of another run or environment; each field that differs is named.
       BadCheckpoint: there are checkpoints, but none can be used.
     """
-    own = run.manifest()
+    ours = run.manifest()
 
     def check(manifest: dict[str, Any]) -> None:
-        _check_same(run.path, own, manifest)
+        _check_same(run.path, ours, manifest)
         check_logs(run.path, manifest)
 
     loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
     before = loaded.manifest.get("versions", {}) if loaded else {}
     changed = [
-        f"{name} {before[name]} -> {own['versions'].get(name)}"
+        f"{name} {before[name]} -> {ours['versions'].get(name)}"
         for name in before
-        if before[name] != own["versions"].get(name)
+        if before[name] != ours["versions"].get(name)
     ]
     if changed:
         display.say(
@@ -86,26 +89,28 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
     return loaded
 
 
-def _check_same(path: Path, own: dict[str, Any], manifest: dict[str, Any]) -> None:
+def _check_same(path: Path, ours: dict[str, Any], manifest: dict[str, Any]) -> None:
     """Refuses a checkpoint that another config or environment wrote.
 
     Raises:
       BadInput: with every field that differs.
     """
     stored = {**to_json(Config()), **manifest["config"]}  # a field added since had its default
+    free = (*fields_with("resumable"), "out")
     differing = [
         f"{name} is {stored[name]!r}, not {value!r}"
-        for name, value in own["config"].items()
-        if name not in (*RESUMABLE, "out") and stored[name] != value
+        for name, value in ours["config"].items()
+        if name not in free and stored[name] != value
     ]
     try:
-        spaces = difference(read_spaces(manifest["spaces"]), read_spaces(own["spaces"]))
+        spaces = difference(read_spaces(manifest["spaces"]), read_spaces(ours["spaces"]))
     except (TypeError, ValueError):
         spaces = "cannot be read"
     if spaces:
         differing.append(f"spaces differ: {spaces}")
-    if manifest["members"] != own["members"]:
-        differing.append("members differ")
+    for name in ("arms", "members"):
+        if manifest[name] != json.loads(json.dumps(ours[name])):
+            differing.append(f"{name} differ")
     if differing:
         raise BadInput(
             f"{path}: its checkpoint is of another run or environment: {'; '.join(differing)}"

@@ -1,4 +1,4 @@
-"""A process (or thread) that trains some of a run's members and tells the coordinator of it."""
+"""A process (or thread) that trains some of a run's members and reports to the coordinator."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sauna.config.presets import RunConfig
+from sauna.config.stored import read_stored, to_stored
+from sauna.envs.spaces import Spaces, read_spaces
 from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.jax_setup import configure_jax
 from sauna.system.processes import Shared, child_ends, receive, send
 from sauna.system.tracebacks import describe_failure
+from sauna.training.prepare import Prepared
 
 if TYPE_CHECKING:
     from sauna.training.loop.job import Job, Reporter
 
-BEAT = 2.0  # seconds between two signs of life
+HEARTBEAT = 2.0  # seconds between two
 
 
 class PipeReporter:
@@ -60,9 +64,7 @@ class PipeReporter:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
             return max(self._granted - iteration, 0)
 
-    def iteration(
-        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
-    ) -> None:
+    def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         header = {"kind": "iteration", "iteration": iteration, "rows": rows, "timing": timing}
         send(self._outbox, header)
 
@@ -70,12 +72,12 @@ class PipeReporter:
         send(self._outbox, {"kind": "state", "iteration": iteration}, arrays)
 
 
-def _beat(outbox: Shared) -> None:
-    """Signs of life, also while an environment or the compiler takes its time."""
+def _send_heartbeats(outbox: Shared) -> None:
+    """Sends heartbeats, also while an environment or the compiler takes its time."""
     try:
         while True:
             send(outbox, {"kind": "alive"})
-            time.sleep(BEAT)
+            time.sleep(HEARTBEAT)
     except OSError:
         return  # nobody listens any more
 
@@ -84,7 +86,7 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     """Receives a job, trains, and reports how it ended."""
     outbox = Shared(outlet)
     if dies_alone:
-        threading.Thread(target=_beat, args=(outbox,), daemon=True).start()
+        threading.Thread(target=_send_heartbeats, args=(outbox,), daemon=True).start()
     try:
         header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
@@ -125,41 +127,34 @@ def _device(config: Mapping[str, Any]) -> str:
 
 
 def write_job(
-    config: dict[str, Any],
-    given: Mapping[str, Any],
-    spaces: tuple[Any, ...],
-    members: list[int],
-    drop_rates: list[list[float]],
+    run: RunConfig,
+    spaces: Spaces,
+    chosen: Sequence[int],
+    drop_rates: Sequence[list[float]],
     start: int,
     replay: bool,
 ) -> dict[str, Any]:
-    """The header of the message that starts a worker; the arrays beside it are a checkpoint's."""
+    """Writes the header of the message that starts a worker; a checkpoint's arrays go beside it.
+
+    Args:
+      chosen: the indices of the worker's members among those of `run`.
+      drop_rates, start, replay: see `Job`.
+    """
     return {
-        "config": config,
-        "given": dict(given),
+        **to_stored(run),
         "spaces": list(spaces),
-        "members": members,
-        "drop_rates": drop_rates,
+        "members": list(chosen),
+        "drop_rates": list(drop_rates),
         "start": start,
         "replay": replay,
     }
 
 
-def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
-    """The `Job` of a `write_job` header."""
-    import json
-
-    from sauna.config.presets import members, stored_config
-    from sauna.envs.spaces import read_spaces
-    from sauna.training.loop.job import Job
-
-    config = stored_config(header["config"])
-    everyone = members(config, header["given"])
-    return Job(
-        config=config,
-        spaces=read_spaces(header["spaces"]),
-        env_kwargs=json.loads(config.env_kwargs),
-        members=[everyone[index] for index in header["members"]],
+def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
+    """Reads the `Job` of a `write_job` header."""
+    prepared = Prepared(read_stored(header), read_spaces(header["spaces"]), None)
+    return prepared.job(
+        header["members"],
         drop_rates=header["drop_rates"],
         restored=arrays or None,
         start=header["start"],

@@ -10,16 +10,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arrays import hypers, random_batch, random_rollout
+from arrays import (
+    hypers,
+    losses_of_terms,
+    losses_on,
+    no_key,
+    parts_of,
+    random_batch,
+    random_rollout,
+)
 from helpers import Recorder, configured, equal, make_job, own, resumed, train_here
 from sauna.algorithm.learner import a2c
 from sauna.algorithm.learner.samples import make_batch
-from sauna.algorithm.learner.update import init_state, minibatch_losses, update
+from sauna.algorithm.learner.update import init_state, update_on_all
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy, score
 from sauna.algorithm.types import Batch
-from sauna.config.presets import PRESET_HELP, PRESETS, resolve, stored_config
+from sauna.config.presets import PRESET_HELP, PRESETS, resolve
 from sauna.config.settings import FIELDS
+from sauna.config.stored import stored_config
 from sauna.envs.spaces import Spaces
 from sauna.experiments.study.command import comparison
 from sauna.experiments.study.spec import check, load_spec
@@ -41,15 +50,19 @@ def job_of(arm: str, env: str = WORLD, iterations: int = 6, **settings: Any) -> 
 
 def test_losses_by_hand() -> None:
     """Two samples and one that does not count, whatever it holds."""
-    got = a2c.combine(
-        jnp.array([-1.0, -2.0, jnp.inf]),
-        jnp.array([3.0, -1.0, 5.0]),
-        jnp.array([1.0, 0.0, 9.0]),
-        jnp.array([2.0, 2.0, 0.0]),
-        jnp.array([4.0, 0.0, 7.0]),
-        jnp.array([1.5, 0.5, 8.0]),
-        jnp.array([1.0, 1.0, 0.0]),
+    got = losses_of_terms(
+        a2c,
         hypers(entropy_coef=0.1, value_coef=0.5, vex_coef=0.25),
+        configured(algorithm="a2c"),
+        log_ratio=[-1.0, -2.0, jnp.inf],
+        advantage=[3.0, -1.0, 5.0],
+        value=[1.0, 0.0, 9.0],
+        old=[0.0, 0.0, 0.0],
+        return_=[2.0, 2.0, 0.0],
+        vex=[2.0, 0.0, 7.0],
+        vex_target=[0.0, 0.0, 0.0],
+        entropy=[1.5, 0.5, 8.0],
+        weight=[1.0, 1.0, 0.0],
     )
     policy, value, vex, entropy = (3.0 - 2.0) / 2, (1.0 + 4.0) / 2, 2.0, 1.0
     total = policy - 0.1 * entropy + 0.5 * value + 0.25 * vex
@@ -60,9 +73,7 @@ def test_losses_by_hand() -> None:
 @partial(jax.jit, static_argnames="config")
 def losses_of(params: Any, batch: Batch, h: Any, config: Any) -> Any:
     policy = make_policy(config, VECTOR)
-    return minibatch_losses(
-        params, batch, h, config=config, policy=policy, target=TARGETS["sample"]
-    )
+    return losses_on(params, batch, h, parts_of(config, policy))
 
 
 gradient_of = jax.jit(
@@ -114,8 +125,8 @@ def test_the_update_is_one_step_of_clipped_rmsprop_over_the_whole_batch() -> Non
     h = hypers(max_grad_norm=0.5, learning_rate=0.02)
     with jax.enable_x64(True):
         policy = make_policy(config, VECTOR)
-        step = jax.jit(partial(update, config=config, policy=policy, target=TARGETS["sample"]))
-        state = init_state(config, policy, jax.random.key(0))
+        step = jax.jit(partial(update_on_all, parts=parts_of(config, policy)))
+        state = init_state(parts_of(config, policy), jax.random.key(0))
         state = jax.tree.map(lambda x: x.astype(jnp.float64), state)
         params = np.asarray(state.params)
         square, zeros, torchs = np.ones_like(params), np.zeros_like(params), params
@@ -147,7 +158,7 @@ def test_n_step_returns_are_lambda_1() -> None:
 
     def returns(gae_lambda: float) -> np.ndarray:
         h = jax.tree.map(np.float32, hypers(gae_lambda=gae_lambda))
-        batch = make_batch(single, h, config=config, target=TARGETS["sample"])
+        batch = make_batch(single, h, no_key(), config=config, target=TARGETS["sample"])
         return np.asarray(batch.return_).reshape(5, 16)
 
     np.testing.assert_allclose(returns(1.0), expected, atol=1e-5)
@@ -221,7 +232,7 @@ def test_either_algorithm_takes_either_optimizer(algorithm: str) -> None:
     found = {}
     for optimizer in ("adam", "rmsprop"):
         config = configured(algorithm=algorithm, optimizer=optimizer, hidden="2")
-        state = init_state(config, make_policy(config, VECTOR), jax.random.key(0))
+        state = init_state(parts_of(config, make_policy(config, VECTOR)), jax.random.key(0))
         named = found[optimizer] = named_optimizer(state)
         again = unpack_optimizer(named, state)
         assert type(again) is type(state.optimizer)

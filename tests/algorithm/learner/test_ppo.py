@@ -8,11 +8,12 @@ import numpy as np
 import optax
 import pytest
 
-from arrays import VECTOR, hypers, random_batch
+from arrays import VECTOR, hypers, losses_of_terms, losses_on, parts_of, random_batch
 from helpers import configured
-from sauna.algorithm.learner.ppo import combine, standardize, surrogate, value_error
-from sauna.algorithm.learner.update import init_state, minibatch_losses, minibatch_order, update
-from sauna.algorithm.learner.vex_targets import TARGETS
+from sauna.algorithm.learner import ppo
+from sauna.algorithm.learner.losses import standardize
+from sauna.algorithm.learner.ppo import surrogate, value_error
+from sauna.algorithm.learner.update import init_state, minibatch_order, update_on_all
 from sauna.algorithm.policy.policy import make_policy
 
 
@@ -47,16 +48,21 @@ def test_losses_equal_plain_sums() -> None:
         log_ratio * 0.3, advantage, value, old, return_, vex, target, entropy, weight, h
     )
     with jax.enable_x64(True):
-        got = combine(
-            jnp.asarray(log_ratio * 0.3),
-            standardize(jnp.asarray(advantage), jnp.asarray(weight)),
-            value_error(jnp.asarray(value), old, return_, h.clip_range),
-            (vex - target) ** 2,
-            jnp.asarray(entropy),
-            jnp.asarray(weight),
+        got = losses_of_terms(
+            ppo,
             h,
+            configured(),
+            log_ratio=log_ratio * 0.3,
+            advantage=standardize(jnp.asarray(advantage), jnp.asarray(weight)),
+            value=value,
+            old=old,
+            return_=return_,
+            vex=vex,
+            vex_target=target,
+            entropy=entropy,
+            weight=weight,
         )
-    np.testing.assert_allclose(got, expected, atol=1e-12)
+    np.testing.assert_allclose(got[:7], expected, atol=1e-12)
 
 
 def test_surrogate_by_hand() -> None:
@@ -84,9 +90,7 @@ def test_gradients_equal_finite_differences(trunk: str, target: str) -> None:
         batch = jax.tree.map(jnp.asarray, random_batch())
 
         def loss(p):
-            return minibatch_losses(
-                p, batch, hypers(), config=config, policy=policy, target=TARGETS[target]
-            ).total
+            return losses_on(p, batch, hypers(), parts_of(config, policy, target)).total
 
         gradient = np.asarray(jax.grad(loss)(params))
         compiled = jax.jit(loss)
@@ -110,13 +114,9 @@ def test_weight_0_samples_do_not_count_even_if_absurd() -> None:
     )
 
     def gradient(part):
-        return jax.grad(
-            lambda p: (
-                minibatch_losses(
-                    p, part, hypers(), config=config, policy=policy, target=TARGETS["sample"]
-                ).total
-            )
-        )(params)
+        return jax.grad(lambda p: losses_on(p, part, hypers(), parts_of(config, policy)).total)(
+            params
+        )
 
     np.testing.assert_array_equal(gradient(batch), gradient(absurd))
 
@@ -129,15 +129,15 @@ def test_update_is_epochs_of_shuffled_minibatches_of_clipped_adam() -> None:
     h = hypers(max_grad_norm=0.05, learning_rate=0.02)
     with jax.enable_x64(True):
         policy = make_policy(config, VECTOR)
-        target = TARGETS["sample"]
+        parts = parts_of(config, policy)
         batch = jax.tree.map(jnp.asarray, random_batch())
         order = minibatch_order(config, seed=7, iteration=2)
-        state = init_state(config, policy, jax.random.key(0))
+        state = init_state(parts, jax.random.key(0))
         state = jax.tree.map(lambda x: x.astype(jnp.float64) if x.dtype == np.float32 else x, state)
-        got, _, norm = update(state, batch, h, order, config=config, policy=policy, target=target)
+        got, _, norm = update_on_all(state, batch, h, order, parts=parts)
 
         def loss(p, part):
-            return minibatch_losses(p, part, h, config=config, policy=policy, target=target).total
+            return losses_on(p, part, h, parts).total
 
         params = np.asarray(state.params)
         mean, square, norms = np.zeros_like(params), np.zeros_like(params), []

@@ -7,12 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arrays import hypers, random_batch, random_rollout
+from arrays import (
+    hypers,
+    losses_of_terms,
+    losses_on,
+    no_key,
+    parts_of,
+    random_batch,
+    random_rollout,
+    unscored,
+)
 from helpers import configured
+from sauna.algorithm.learner import ppo
 from sauna.algorithm.learner.metrics import head_statistics
-from sauna.algorithm.learner.ppo import combine
 from sauna.algorithm.learner.samples import advantages_over_all, make_batch
-from sauna.algorithm.learner.update import minibatch_losses, minibatch_order
+from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.rollout.program import decide, make_program
@@ -39,7 +48,7 @@ def scalars(**values: float) -> Hypers:
 @pytest.mark.parametrize("name", ["rollout", "sample"])
 def test_returns_and_targets_are_those_of_the_kept_steps(name: str) -> None:
     rollout = random_rollout(7, keep_rate=0.6)
-    batch = make_batch(single(rollout), scalars(), config=CONFIG, target=TARGETS[name])
+    batch = make_batch(single(rollout), scalars(), no_key(), config=CONFIG, target=TARGETS[name])
     advantage = np.asarray(advantages_over_all(single(rollout), scalars(), True))
     columns = [
         np.asarray(x).reshape(40, 3)
@@ -65,9 +74,7 @@ def test_a_target_per_minibatch_is_computed_on_the_minibatch() -> None:
     batch = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), random_batch())
     output = policy.apply(params, batch.observation)
     for name in ("minibatch", "sample"):
-        losses = minibatch_losses(
-            params, batch, scalars(), config=CONFIG, policy=policy, target=TARGETS[name]
-        )
+        losses = losses_on(params, batch, scalars(), parts_of(CONFIG, policy, name))
         on = np.asarray(batch.weight) > 0
         residual, return_ = (
             np.asarray(batch.return_ - batch.value)[on],
@@ -82,8 +89,12 @@ def test_a_target_per_minibatch_is_computed_on_the_minibatch() -> None:
 def test_a_masked_slot_counts_for_nothing_whatever_is_in_it() -> None:
     weight = jnp.array([1.0, 1.0, 0.0])
     ones = jnp.ones(3)
-    plain = combine(jnp.array([0.1, -0.2, 0.0]), ones, ones, ones, ones, weight, scalars())
-    wild = combine(jnp.array([0.1, -0.2, 500.0]), ones, ones, ones, ones, weight, scalars())
+    names = ("advantage", "value", "old", "return_", "vex", "vex_target", "entropy")
+    terms = {**dict.fromkeys(names, ones), "weight": weight}
+    plain, wild = (
+        losses_of_terms(ppo, scalars(), CONFIG, log_ratio=[0.1, -0.2, odd], **terms)[:7]
+        for odd in (0.0, 500.0)
+    )
     assert all(np.isfinite(x) for x in wild)
     np.testing.assert_array_equal(plain, wild)
 
@@ -140,8 +151,9 @@ def test_stretches_decide_as_one_long_stretch_does(filter) -> None:
         state, first, masks = filter.init(2, 12), 0, []
         for length in lengths:
             rows = jnp.full((12, 2), 99.0).at[:length].set(vex[first : first + length])
+            steps = unscored(observation, rows)
             state, mask = decide(
-                filter, state, observation, rows, jnp.int32(first), jnp.int32(length), key, given
+                filter, state, steps, jnp.int32(first), jnp.int32(length), key, given
             )
             assert not mask[length:].any()
             masks.append(np.asarray(mask[:length]))

@@ -21,7 +21,7 @@ from sauna.envs.device.contract import advance, begin, flat
 from sauna.envs.host.contract import HostEnvs, Step
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.errors import BadInput
-from sauna.training.loop.device_program import MOST_PER_CALL
+from sauna.training.loop.device_program import MAX_PER_CALL
 from sauna.training.loop.job import NonFinite
 
 N = 3
@@ -178,7 +178,7 @@ def test_results_do_not_depend_on_how_many_iterations_a_call_runs() -> None:
     train_members(device_job(), single)
     assert equal(whole.final, single.final)
     assert whole.rows == single.rows
-    assert len(whole.rows) < MOST_PER_CALL
+    assert len(whole.rows) < MAX_PER_CALL
 
 
 @pytest.mark.parametrize("reset", ["fresh", pytest.param("cached", marks=slow)])

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from arrays import hypers
+from arrays import hypers, unscored
 from helpers import configured, equal, make_job, own, resumed, train_here
 from sauna.algorithm.rollout.program import decide
 from sauna.algorithm.selection import vex_filter
@@ -26,20 +26,22 @@ from sauna.algorithm.selection.vex_filter import (
     sauna_per_env,
     threshold_held,
 )
-from sauna.algorithm.types import Filter
+from sauna.algorithm.types import StepFilter
 from sauna.system.errors import BadInput
 from sauna.training.loop.budget import hypers_now, scheduled
 from sauna.training.loop.member_state import Counters
 
 
-def run(filter: Filter, vex: np.ndarray, threshold: float = 0.3, rate: float = 0.0) -> np.ndarray:
+def run(
+    filter: StepFilter, vex: np.ndarray, threshold: float = 0.3, rate: float = 0.0
+) -> np.ndarray:
     """The filter's mask `[S, N]`, decided step by step."""
     state = filter.init(vex.shape[1], len(vex))
     h = jax.tree.map(np.float32, hypers(threshold=threshold, drop_rate=rate))
     masks, keep = [], jax.jit(filter.keep)
     for t, x in enumerate(vex):
         key = jax.random.fold_in(jax.random.key(5), t)
-        state, mask = keep(state, jnp.zeros((vex.shape[1], 2)), jnp.asarray(x), key, h)
+        state, mask = keep(state, unscored(jnp.zeros((vex.shape[1], 2)), jnp.asarray(x)), key, h)
         masks.append(np.asarray(mask))
     return np.stack(masks)
 
@@ -138,8 +140,7 @@ def test_deciding_in_stretches_is_deciding_step_by_step(name: str) -> None:
         state, mask = decide(
             filter,
             state,
-            jnp.zeros((30, 2, 4)),
-            jnp.asarray(padded),
+            unscored(jnp.zeros((30, 2, 4)), jnp.asarray(padded)),
             t,
             length,
             jax.random.key(5),
@@ -199,12 +200,12 @@ def test_a_keep_rate_is_held_whatever_the_predictions(kind: str, rate: float) ->
         assert run_quickly(sauna_per_env("all", steps), vex, 0.8).all()
 
 
-def run_quickly(filter: Filter, vex: np.ndarray, threshold: float = 0.3) -> np.ndarray:
+def run_quickly(filter: StepFilter, vex: np.ndarray, threshold: float = 0.3) -> np.ndarray:
     h = jax.tree.map(np.float32, hypers(threshold=threshold))
     state = filter.init(vex.shape[1], len(vex))
     none = jnp.zeros((len(vex), vex.shape[1], 1))
     call = jax.jit(lambda *a: decide(filter, *a, h))
-    mask = call(state, none, jnp.asarray(vex), 0, len(vex), jax.random.key(0))[1]
+    mask = call(state, unscored(none, jnp.asarray(vex)), 0, len(vex), jax.random.key(0))[1]
     return np.asarray(mask)
 
 

@@ -11,11 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arrays import VECTOR, hypers, random_batch
+from arrays import VECTOR, hypers, losses_on, parts_of, random_batch
 from helpers import configured
 from sauna import train
-from sauna.algorithm.learner.update import minibatch_losses
-from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import make_policy
 from sauna.experiments import measure
@@ -50,9 +48,7 @@ def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
         h = hypers(entropy_coef=0.0, value_coef=0.0, vex_coef=0.0)
 
         def loss(params: Any) -> Any:
-            return minibatch_losses(
-                params, batch, h, config=config, policy=policy, target=TARGETS["sample"]
-            ).total
+            return losses_on(params, batch, h, parts_of(config, policy)).total
 
         got = policy_gradient(
             params,

@@ -1,4 +1,4 @@
-"""Advantage actor-critic (A2C), the synchronous form of A3C (Mnih et al. 2016): its losses.
+"""Advantage actor-critic (A2C), the synchronous form of A3C (Mnih et al. 2016): its objective.
 
 Collecting, advantages, filters, Vex targets, optimizers and everything around them are the same as
 for PPO. With one pass over the whole rollout, which is what A2C makes, the ratio of PPO's
@@ -10,30 +10,53 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.ppo import Losses, weigh, weighted_mean
-from sauna.algorithm.types import Array, Hypers
+from sauna.algorithm.learner.losses import (
+    Losses,
+    Minibatch,
+    masked_mean,
+    value_weight,
+    vex_loss_of,
+    weigh,
+    weigh_policy,
+    weighted_mean,
+)
+from sauna.algorithm.policy.distributions import Distribution
+from sauna.algorithm.selection.registry import Rules
+from sauna.algorithm.types import Hypers, PolicyOutput
+from sauna.config.settings import Config
 
 
-def combine(
-    log_prob: Array,
-    advantage: Array,
-    value: Array,
-    return_: Array,
-    vex_error: Array,
-    entropy: Array,
-    weight: Array,
+def losses(
+    output: PolicyOutput,
+    critic: PolicyOutput,
+    minibatch: Minibatch,
     hypers: Hypers,
+    *,
+    config: Config,
+    distribution: Distribution,
+    rules: Rules,
 ) -> Losses:
     """`mean(-log pi(a|s) A)`, `mean((V - R)^2)`, entropy and Vex loss, as in baselines' `a2c.py`.
 
-    All arguments but `hypers` are `[B]`. There is no old policy to compare with, so KL and clip
-    fraction are NaN, which leaves them out of the metrics.
+    There is no old policy to compare with, so KL and clip fraction are NaN, which leaves them out
+    of the metrics.
     """
-    log_prob = jnp.where(weight > 0, log_prob, 0.0)
-    policy_loss = weighted_mean(-log_prob * advantage, weight)
-    value_loss = weighted_mean((value - return_) ** 2, weight)
-    vex_loss = weighted_mean(vex_error, weight)
-    mean_entropy = weighted_mean(entropy, weight)
+    rows, values = minibatch.rows, minibatch.value_rows
+    log_prob = distribution.log_prob(output.policy, rows.action)
+    log_prob = jnp.where(rows.weight > 0, log_prob, 0.0)
+    entropy = distribution.entropy(output.policy)
+    log_prob, mask, scale, effective = weigh_policy(
+        output, minibatch, log_prob, log_prob, entropy, distribution=distribution, rules=rules
+    )
+    terms = -log_prob * minibatch.advantage
+    policy_loss = masked_mean(terms, mask, scale)
+    if rules.critic is None:
+        errors = (critic.value - values.return_) ** 2
+        value_loss = masked_mean(errors, minibatch.value_mask, minibatch.value_scale)
+    else:
+        value_loss = rules.critic(values.return_ - critic.value, value_weight(minibatch))
+    vex_loss = vex_loss_of(critic, minibatch)
+    mean_entropy = weighted_mean(entropy, rows.weight)
     total = weigh(policy_loss, value_loss, vex_loss, mean_entropy, hypers)
     none = jnp.full_like(total, jnp.nan)
-    return Losses(total, policy_loss, value_loss, vex_loss, mean_entropy, none, none)
+    return Losses(total, policy_loss, value_loss, vex_loss, mean_entropy, none, none, effective)

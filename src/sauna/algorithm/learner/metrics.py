@@ -6,8 +6,18 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.ppo import weighted_mean
+from sauna.algorithm.learner.losses import weighted_mean
 from sauna.algorithm.types import Array
+
+
+class Work(NamedTuple):
+    """What one iteration's update took; `[]` each."""
+
+    gradient_steps: Array
+    sample_rate: Array  # rows that the policy loss draws per epoch, of those that are there
+    samples_forward: Array  # rows through the network, with those that a rule only looks at
+    samples_backward: Array  # rows through its gradient
+    effective_sample_size: Array  # (sum w)^2 / sum w^2 of a minibatch's policy weights, the mean
 
 
 class UpdateMetrics(NamedTuple):
@@ -30,6 +40,7 @@ class UpdateMetrics(NamedTuple):
     vex_median: Array
     threshold: Array  # where it moves: that of this iteration; else NaN
     finite: Array  # bool: parameters and losses are finite
+    work: Work
 
 
 def variance_explained(return_: Array, value: Array, weight: Array) -> Array:

@@ -1,39 +1,84 @@
-"""The objective of eq. 6: clipped surrogate, value loss, entropy and Vex loss. A2C's: `a2c.py`.
+"""PPO's objective: eq. 6 of the paper, on one minibatch. A2C's is in `a2c.py`.
 
-All means are weighted: a slot with weight 0 (left empty, or masked by the filter) counts for
-nothing. With every weight 1 they are plain means.
+    total = policy_loss - c_ent entropy + c1 value_loss + c2 vex_loss
+
+All means are weighted: a row with weight 0 (a slot left empty) counts for nothing. With every
+weight 1 they are plain means.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 
-from sauna.algorithm.types import Array, Hypers
+from sauna.algorithm.learner.losses import (
+    Losses,
+    Minibatch,
+    masked_mean,
+    value_weight,
+    vex_loss_of,
+    weigh,
+    weigh_policy,
+    weighted_mean,
+)
+from sauna.algorithm.policy.distributions import Distribution
+from sauna.algorithm.selection.registry import Rules
+from sauna.algorithm.types import Array, Hypers, PolicyOutput
+from sauna.config.settings import Config
 
 
-class Losses(NamedTuple):
-    """Scalars of one minibatch; NaN where an algorithm has no such number."""
+def losses(
+    output: PolicyOutput,
+    critic: PolicyOutput,
+    minibatch: Minibatch,
+    hypers: Hypers,
+    *,
+    config: Config,
+    distribution: Distribution,
+    rules: Rules,
+) -> Losses:
+    """PPO's losses, their total and what is logged beside it.
 
-    total: Array
-    policy_loss: Array
-    value_loss: Array
-    vex_loss: Array
-    entropy: Array
-    kl: Array
-    clip_fraction: Array
+    The KL estimate is `mean((r - 1) - log r)` (Schulman's k3), of new against old policy.
 
-
-def weighted_mean(x: Array, weight: Array) -> Array:
-    """`sum(w x) / sum(w)` of `[B]` arrays; 0 where all weights are 0."""
-    return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
-
-
-def standardize(advantage: Array, weight: Array) -> Array:
-    """`(A - mean) / (std + 1e-8)` over a minibatch `[B]`, population std as in baselines."""
-    centred = advantage - weighted_mean(advantage, weight)
-    return centred / (jnp.sqrt(weighted_mean(centred**2, weight)) + 1e-8)
+    Args:
+      output: the network at the rows of the policy loss `[B]`.
+      critic: the network at the rows of the value loss `[B]`, as a rule the same.
+    """
+    rows, values = minibatch.rows, minibatch.value_rows
+    log_prob = distribution.log_prob(output.policy, rows.action)
+    log_ratio = jnp.where(rows.weight > 0, log_prob - rows.log_prob, 0.0)
+    entropy = distribution.entropy(output.policy)
+    log_ratio, mask, scale, effective = weigh_policy(
+        output, minibatch, log_prob, log_ratio, entropy, distribution=distribution, rules=rules
+    )
+    form = rules.objective or surrogate
+    terms = form(log_ratio, minibatch.advantage, hypers.clip_range)
+    policy_loss = masked_mean(terms, mask, scale)
+    value_clip = hypers.clip_range if config.clip_value else None
+    if rules.critic is None:
+        errors = value_error(critic.value, values.value, values.return_, value_clip)
+        value_loss = masked_mean(errors, minibatch.value_mask, minibatch.value_scale)
+    else:
+        value_loss = rules.critic(values.return_ - critic.value, value_weight(minibatch))
+    vex_loss = vex_loss_of(critic, minibatch)
+    mean_entropy = weighted_mean(entropy, rows.weight)
+    total = weigh(policy_loss, value_loss, vex_loss, mean_entropy, hypers)
+    ratio = jnp.exp(log_ratio)
+    kl = weighted_mean((ratio - 1.0) - log_ratio, rows.weight)
+    outside = (jnp.abs(ratio - 1.0) > hypers.clip_range).astype(ratio.dtype)
+    clip_fraction = weighted_mean(outside, rows.weight)
+    stop = None if rules.stop is None else rules.stop.exceeded(log_ratio, rows.weight)
+    return Losses(
+        total,
+        policy_loss,
+        value_loss,
+        vex_loss,
+        mean_entropy,
+        kl,
+        clip_fraction,
+        effective,
+        stop,
+    )
 
 
 def surrogate(log_ratio: Array, advantage: Array, clip_range: Array) -> Array:
@@ -53,38 +98,3 @@ def value_error(value: Array, old: Array, return_: Array, clip_range: Array | No
         clipped = old + jnp.clip(value - old, -clip_range, clip_range)
         error = jnp.maximum(error, (clipped - return_) ** 2)
     return 0.5 * error
-
-
-def weigh(
-    policy_loss: Array, value_loss: Array, vex_loss: Array, entropy: Array, hypers: Hypers
-) -> Array:
-    """The total of eq. 6: `policy - c_ent * entropy + c1 * value + c2 * vex`."""
-    total = policy_loss - hypers.entropy_coef * entropy
-    return total + hypers.value_coef * value_loss + hypers.vex_coef * vex_loss
-
-
-def combine(
-    log_ratio: Array,
-    advantage: Array,
-    value_errors: Array,
-    vex_error: Array,
-    entropy: Array,
-    weight: Array,
-    hypers: Hypers,
-) -> Losses:
-    """PPO's losses, their total and what is logged beside it.
-
-    The KL estimate is `mean((r - 1) - log r)` (Schulman's k3), of new against old policy.
-    """
-    log_ratio = jnp.where(weight > 0, log_ratio, 0.0)
-    ratio = jnp.exp(log_ratio)
-    policy_loss = weighted_mean(surrogate(log_ratio, advantage, hypers.clip_range), weight)
-    value_loss = weighted_mean(value_errors, weight)
-    vex_loss = weighted_mean(vex_error, weight)
-    mean_entropy = weighted_mean(entropy, weight)
-    total = weigh(policy_loss, value_loss, vex_loss, mean_entropy, hypers)
-    kl = weighted_mean((ratio - 1.0) - log_ratio, weight)
-    outside = (jnp.abs(ratio - 1.0) > hypers.clip_range).astype(ratio.dtype)
-    return Losses(
-        total, policy_loss, value_loss, vex_loss, mean_entropy, kl, weighted_mean(outside, weight)
-    )

@@ -8,13 +8,16 @@ from typing import Any, NamedTuple
 
 import jax
 
+from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.metrics import UpdateMetrics
 from sauna.algorithm.learner.samples import make_batch
-from sauna.algorithm.learner.update import init_state, learn
+from sauna.algorithm.learner.update import Parts, init_state
 from sauna.algorithm.learner.vex_targets import make_target
 from sauna.algorithm.policy.policy import Policy
+from sauna.algorithm.selection.registry import make_rules
 from sauna.algorithm.types import Array, Batch, Hypers, Rollout, TrainState
 from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
 
 
 class Learner(NamedTuple):
@@ -24,23 +27,33 @@ class Learner(NamedTuple):
 
     Attributes:
       init: `key -> TrainState`.
-      make_batch: `(rollout, hypers) -> Batch`.
-      learn: `(state, rollout, batch, hypers, order) -> (TrainState, UpdateMetrics)`; it takes over
-        the memory of `state`.
+      make_batch: `(rollout, hypers, key) -> Batch`.
+      learn: `(state, rollout, batch, hypers, order, key) -> (TrainState, UpdateMetrics)`; it takes
+        over the memory of `state`.
     """
 
     init: Callable[[Array], TrainState]
-    make_batch: Callable[[Rollout, Hypers], Batch]
-    learn: Callable[[TrainState, Rollout, Batch, Hypers, Any], tuple[TrainState, UpdateMetrics]]
+    make_batch: Callable[[Rollout, Hypers, Any], Batch]
+    learn: Callable[
+        [TrainState, Rollout, Batch, Hypers, Any, Any], tuple[TrainState, UpdateMetrics]
+    ]
 
 
-def make_learner(config: Config, policy: Policy) -> Learner:
+def make_parts(config: Config, policy: Policy, spaces: Spaces) -> Parts:
+    """Gathers the static parts of learning.
+
+    Raises:
+      BadInput: a rule or a target cannot be made.
+    """
+    rules = make_rules(config, spaces.action_kind, spaces.action_sizes)
+    return Parts(config, policy, make_target(config), rules)
+
+
+def make_learner(config: Config, policy: Policy, spaces: Spaces) -> Learner:
     """Builds (without compiling) what members with this static config learn by."""
-    target = make_target(config)
+    parts = make_parts(config, policy, spaces)
     return Learner(
-        init=jax.jit(partial(init_state, config, policy)),
-        make_batch=jax.jit(partial(make_batch, config=config, target=target)),
-        learn=jax.jit(
-            partial(learn, config=config, policy=policy, target=target), donate_argnums=(0,)
-        ),
+        init=jax.jit(partial(init_state, parts)),
+        make_batch=jax.jit(partial(make_batch, config=config, target=parts.target)),
+        learn=jax.jit(partial(learn, parts=parts), donate_argnums=(0,)),
     )

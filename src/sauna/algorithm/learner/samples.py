@@ -7,6 +7,8 @@ import jax.numpy as jnp
 
 from sauna.algorithm.learner.advantages import gae
 from sauna.algorithm.learner.vex_targets import VexTarget
+from sauna.algorithm.selection.avec import unbiased
+from sauna.algorithm.selection.control import controlled_filter
 from sauna.algorithm.types import Array, Batch, Hypers, Rollout
 from sauna.config.settings import Config
 
@@ -76,16 +78,25 @@ def episode_numbers(rollout: Rollout, rows: Array) -> Array:
     return jnp.cumsum(changed, 0).astype(jnp.int32)
 
 
-def make_batch(rollout: Rollout, hypers: Hypers, *, config: Config, target: VexTarget) -> Batch:
+def make_batch(
+    rollout: Rollout, hypers: Hypers, key: Array, *, config: Config, target: VexTarget
+) -> Batch:
     """Advantages, returns and Vex targets of the kept steps, flattened to `[T * N]`.
 
     With fewer than T kept steps in an env the remaining slots have weight 0.
+
+    Args:
+      key: of the draws of this iteration's selection; read by a filter's matched control alone.
     """
-    rows = kept_rows(rollout.keep, config.rollout_steps)
+    if config.critic == "avec":
+        rollout = with_unbiased_value(rollout, hypers, config)
     if config.gae_over == "all":
         over_all = advantages_over_all(rollout, hypers, config.truncation == "bootstrap")
+        rollout = with_matched_control(rollout, over_all, key, config)
+        rows = kept_rows(rollout.keep, config.rollout_steps)
         advantage = take(over_all, rows)
     else:
+        rows = kept_rows(rollout.keep, config.rollout_steps)
         advantage = advantages_over_kept(rollout, rows, hypers)
     value = take(rollout.value, rows)
     weight = take(rollout.keep, rows).astype(jnp.float32)
@@ -102,5 +113,66 @@ def make_batch(rollout: Rollout, hypers: Hypers, *, config: Config, target: VexT
         value,
         vex_target,
         weight,
+        take(rollout.vex, rows),
     )
+    if config.auxiliary != "none":
+        following, there = next_observations(rollout)
+        batch = batch._replace(
+            next_observation=take(following, rows), next_weight=take(there, rows) * weight
+        )
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
+
+
+def with_matched_control(rollout: Rollout, advantage: Array, key: Array, config: Config) -> Rollout:
+    """The rollout with as many steps kept as its filter kept, chosen by the control, if any."""
+    if config.control == "none" or config.filter == "none":
+        return rollout
+    keep = controlled_filter(config.control, rollout.keep, advantage, rollout.valid, key)
+    return rollout._replace(keep=keep)
+
+
+def with_unbiased_value(rollout: Rollout, hypers: Hypers, config: Config) -> Rollout:
+    """The rollout with the constant added to its values that makes `mean(R - V)` 0."""
+    weight = rollout.valid.astype(jnp.float32)
+    bootstrap = config.truncation == "bootstrap"
+    advantage = advantages_over_all(rollout, hypers, bootstrap)
+    one, zero = jnp.ones_like(rollout.value), jnp.zeros_like(rollout.value)
+    constant = rollout._replace(reward=zero, value=one, next_value=one)
+    c = unbiased(advantage, advantages_over_all(constant, hypers, bootstrap), weight)
+    return rollout._replace(value=rollout.value + c, next_value=rollout.next_value + c)
+
+
+def next_observations(rollout: Rollout) -> tuple[Array, Array]:
+    """The observation after each step `[S, N, ...]`, and 1 where it is of the same episode.
+
+    The observation after the last step of a rollout is not in it, nor the final one of an episode.
+    """
+    following = jnp.concatenate([rollout.observation[1:], rollout.observation[-1:]])
+    ended = rollout.terminated | rollout.truncated
+    valid_next = jnp.concatenate([rollout.valid[1:], jnp.zeros_like(rollout.valid[:1])])
+    return following, (valid_next & ~ended).astype(jnp.float32)
+
+
+def recomputed(
+    batch: Batch, rollout: Rollout, value: Array, hypers: Hypers, *, config: Config
+) -> Batch:
+    """The batch with the advantages and returns that other values of the same steps give.
+
+    Where a step's successor is not a step of the rollout (at an episode's end, behind the last
+    step), its value stays that of collection. Value clipping goes on from the value at collection.
+
+    Args:
+      value: `[S, N]` of the rollout's observations by today's network.
+    """
+    last = ~jnp.concatenate([rollout.valid[1:], jnp.zeros_like(rollout.valid[:1])])
+    outside = rollout.terminated | rollout.truncated | last
+    following = jnp.concatenate([value[1:], value[-1:]])
+    now = rollout._replace(
+        value=value, next_value=jnp.where(outside, rollout.next_value, following)
+    )
+    if config.critic == "avec":
+        now = with_unbiased_value(now, hypers, config)
+    over_all = advantages_over_all(now, hypers, config.truncation == "bootstrap")
+    rows = kept_rows(rollout.keep, config.rollout_steps)
+    advantage = take(over_all, rows).ravel()
+    return batch._replace(advantage=advantage, return_=advantage + take(now.value, rows).ravel())

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
-from sauna.algorithm.learner import a2c
-from sauna.algorithm.learner.metrics import UpdateMetrics, head_statistics, variance_explained
-from sauna.algorithm.learner.ppo import Losses, combine, standardize, value_error, weighted_mean
+from sauna.algorithm.learner import a2c, ppo
+from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
 from sauna.algorithm.learner.vex_targets import VexTarget
 from sauna.algorithm.policy.policy import Policy
-from sauna.algorithm.selection.vex_filter import moved_threshold
-from sauna.algorithm.types import Array, Batch, Hypers, Rollout, TrainState
+from sauna.algorithm.selection.positive import cut_at_zero
+from sauna.algorithm.selection.registry import Rules
+from sauna.algorithm.types import Array, Batch, Hypers, TrainState
 from sauna.config.settings import Config
+
+
+class Parts(NamedTuple):
+    """The static parts of learning."""
+
+    config: Config
+    policy: Policy
+    target: VexTarget
+    rules: Rules
 
 
 def scaling(config: Config) -> optax.GradientTransformation:
@@ -35,9 +46,11 @@ def optimizer(config: Config, hypers: Hypers) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(hypers.max_grad_norm), scaling(config))
 
 
-def init_state(config: Config, policy: Policy, key: Array) -> TrainState:
-    params = policy.init(key)
-    return TrainState(params, scaling(config).init(params))
+def init_state(parts: Parts, key: Array) -> TrainState:
+    params = parts.policy.init(key)
+    sampler = parts.rules.sampler
+    carried = sampler.init() if sampler else ()
+    return TrainState(params, scaling(parts.config).init(params), carried)
 
 
 def vex_targets(batch: Batch, target: VexTarget) -> Array:
@@ -48,58 +61,71 @@ def vex_targets(batch: Batch, target: VexTarget) -> Array:
     return target.target(batch.return_, batch.value, batch.weight, one_episode)
 
 
+def plain_minibatch(rows: Batch, parts: Parts) -> Minibatch:
+    """The rows `[B]` of one gradient step, each of which counts as its weight says."""
+    target = vex_targets(rows, parts.target)
+    advantage = minibatch_advantage(rows, parts.config)
+    return Minibatch(rows, rows, advantage, target, rows.weight, None, rows.weight, None)
+
+
+def minibatch_advantage(rows: Batch, config: Config) -> Array:
+    """The advantages `[B]` as the loss uses them.
+
+    They are standardised here unless that was done over a larger set before.
+    """
+    if config.advantage_sign == "positive":
+        return cut_at_zero(rows.advantage, rows.weight)
+    if config.normalize_advantages and config.normalize_over == "minibatch":
+        return standardize(rows.advantage, rows.weight)
+    return rows.advantage
+
+
 def minibatch_losses(
-    params: Array,
-    batch: Batch,
-    hypers: Hypers,
-    *,
-    config: Config,
-    policy: Policy,
-    target: VexTarget,
+    params: Array, minibatch: Minibatch, hypers: Hypers, *, parts: Parts
 ) -> Losses:
-    """The algorithm's objective on one minibatch of `[B]` samples."""
-    output = policy.apply(params, batch.observation)
-    advantage = batch.advantage
-    if config.normalize_advantages:
-        advantage = standardize(advantage, batch.weight)
-    vex_target = vex_targets(batch, target)
-    log_prob = policy.distribution.log_prob(output.policy, batch.action)
-    if config.algorithm == "a2c":
-        return a2c.combine(
-            log_prob,
-            advantage,
-            output.value,
-            batch.return_,
-            (output.vex - vex_target) ** 2,
-            policy.distribution.entropy(output.policy),
-            batch.weight,
-            hypers,
-        )
-    return combine(
-        log_prob - batch.log_prob,
-        advantage,
-        value_error(
-            output.value,
-            batch.value,
-            batch.return_,
-            hypers.clip_range if config.clip_value else None,
-        ),
-        (output.vex - vex_target) ** 2,
-        policy.distribution.entropy(output.policy),
-        batch.weight,
+    """The algorithm's objective on one minibatch of `B` rows."""
+    config, policy, rules = parts.config, parts.policy, parts.rules
+    output = policy.apply(params, minibatch.rows.observation)
+    critic = output
+    if minibatch.value_rows is not minibatch.rows:
+        critic = policy.apply(params, minibatch.value_rows.observation)
+    objective = a2c.losses if config.algorithm == "a2c" else ppo.losses
+    losses = objective(
+        output,
+        critic,
+        minibatch,
         hypers,
+        config=config,
+        distribution=policy.distribution,
+        rules=rules,
     )
+    if rules.auxiliary is None:
+        return losses
+    rows = minibatch.value_rows
+    extra = rules.auxiliary(
+        critic.prediction, rows.observation, rows.next_observation, rows.next_weight
+    )
+    return losses._replace(total=losses.total + config.auxiliary_coef * extra)
 
 
-def update(
-    state: TrainState,
-    batch: Batch,
-    hypers: Hypers,
-    order: Array,
-    *,
-    config: Config,
-    policy: Policy,
-    target: VexTarget,
+def gradient_step(
+    state: TrainState, minibatch: Minibatch, hypers: Hypers, *, parts: Parts
+) -> tuple[TrainState, Losses, Array]:
+    """One step down the gradient; the losses before it, and the gradient's norm before clipping."""
+
+    def loss(params: Array) -> tuple[Array, Losses]:
+        losses = minibatch_losses(params, minibatch, hypers, parts=parts)
+        return losses.total, losses
+
+    gradient, losses = jax.grad(loss, has_aux=True)(state.params)
+    transform = optimizer(parts.config, hypers)
+    step, (_, scale) = transform.update(gradient, (optax.EmptyState(), state.optimizer))
+    params = state.params - hypers.learning_rate * step
+    return TrainState(params, scale, state.sampler), losses, jnp.linalg.norm(gradient)
+
+
+def update_on_all(
+    state: TrainState, batch: Batch, hypers: Hypers, order: Array, *, parts: Parts
 ) -> tuple[TrainState, Losses, Array]:
     """`epochs` passes over `batch` in `minibatches` shuffled parts each.
 
@@ -112,56 +138,16 @@ def update(
       the new state, the mean losses, and the mean gradient norm before clipping.
     """
 
-    def loss(params: Array, part: Batch) -> tuple[Array, Losses]:
-        losses = minibatch_losses(params, part, hypers, config=config, policy=policy, target=target)
-        return losses.total, losses
-
-    transform = optimizer(config, hypers)
-
-    def minibatch(state: TrainState, rows: Array) -> tuple[TrainState, tuple[Losses, Array]]:
+    def step(state: TrainState, rows: Array) -> tuple[TrainState, tuple[Losses, Array]]:
         part = jax.tree.map(lambda x: x[rows], batch)
-        gradient, losses = jax.grad(loss, has_aux=True)(state.params, part)
-        step, (_, scale) = transform.update(gradient, (optax.EmptyState(), state.optimizer))
-        params = state.params - hypers.learning_rate * step
-        return TrainState(params, scale), (losses, jnp.linalg.norm(gradient))
+        state, losses, norm = gradient_step(
+            state, plain_minibatch(part, parts), hypers, parts=parts
+        )
+        return state, (losses, norm)
 
-    parts = order.reshape((config.epochs * config.minibatches, -1))
-    state, (losses, norms) = jax.lax.scan(minibatch, state, parts)
+    steps = order.reshape((parts.config.epochs * parts.config.minibatches, -1))
+    state, (losses, norms) = jax.lax.scan(step, state, steps)
     return state, jax.tree.map(jnp.mean, losses), jnp.mean(norms)
-
-
-def learn(
-    state: TrainState,
-    rollout: Rollout,
-    batch: Batch,
-    hypers: Hypers,
-    order: Array,
-    *,
-    config: Config,
-    policy: Policy,
-    target: VexTarget,
-) -> tuple[TrainState, UpdateMetrics]:
-    """The update and everything that is logged about it."""
-    mean_target = weighted_mean(vex_targets(batch, target), batch.weight)
-    state, losses, gradient_norm = update(
-        state, batch, hypers, order, config=config, policy=policy, target=target
-    )
-    finite = jnp.isfinite(losses.total) & jnp.all(jnp.isfinite(state.params))
-    metrics = UpdateMetrics(
-        losses.policy_loss,
-        losses.value_loss,
-        losses.vex_loss,
-        losses.entropy,
-        losses.kl,
-        losses.clip_fraction,
-        gradient_norm,
-        variance_explained(batch.return_, batch.value, batch.weight),
-        mean_target,
-        *head_statistics(rollout.vex, rollout.valid),
-        moved_threshold(rollout, hypers, config),
-        finite,
-    )
-    return state, metrics
 
 
 def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:

@@ -78,12 +78,14 @@ class ActorCritic(nn.Module):
       num_outputs: width of the policy head.
       log_std_init: start of the state-independent log-std, or None for discrete actions.
       shared: one trunk for all heads.
+      predicted: width of the auxiliary head, which stands beside the value head; 0: there is none.
     """
 
     make_trunk: Callable[[str], nn.Module]
     num_outputs: int
     log_std_init: float | None
     shared: bool
+    predicted: int = 0
 
     @nn.compact
     def __call__(self, observation: Array) -> PolicyOutput:
@@ -92,6 +94,7 @@ class ActorCritic(nn.Module):
         value_features = (
             policy_features if self.shared else self.make_trunk("value_trunk")(observation)
         )
+        hidden = policy_features
         policy = dense(self.num_outputs, 0.01, "policy_head")(policy_features)
         if self.log_std_init is not None:
             start = nn.initializers.constant(self.log_std_init)
@@ -99,4 +102,7 @@ class ActorCritic(nn.Module):
             policy = jnp.concatenate([policy, jnp.broadcast_to(log_std, policy.shape)], -1)
         value = dense(1, 1.0, "value_head")(value_features)[..., 0]
         vex = dense(1, 1.0, "vex_head")(value_features)[..., 0]
-        return PolicyOutput(policy, value, vex)
+        prediction = None
+        if self.predicted:
+            prediction = dense(self.predicted, 1.0, "auxiliary_head")(value_features)
+        return PolicyOutput(policy, value, vex, hidden, prediction)

@@ -96,6 +96,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         distribution.num_outputs,
         config.log_std_init if distribution.has_log_std else None,
         config.trunk == "shared",
+        0 if config.auxiliary == "none" else spaces.observation_shape[0],
     )
     example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
     unravel = _unraveler(jax.eval_shape(network.init, jax.random.key(0), example))

@@ -28,7 +28,7 @@ from sauna.algorithm.policy.normalize import (
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import draw_noise
-from sauna.algorithm.types import Array, Filter, Hypers, Keys, Rollout
+from sauna.algorithm.types import Array, Hypers, Keys, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv, Running, Transition, advance, begin
 
@@ -74,7 +74,7 @@ class Collecting(NamedTuple):
     config: Config
     env: JaxEnv  # flat
     policy: Policy
-    filter: Filter | None
+    filter: StepFilter | None
     anywhere: Callable[[Array], Array]  # see `jax_env.advance`
 
 
@@ -215,9 +215,9 @@ def _step(
     action = policy.distribution.sample(output.policy, noise)
     keep, filter_state = acting, carry.filter
     if parts.filter is not None:
-        filter_state, decided = parts.filter.keep(
-            carry.filter, observation, output.vex, filter_key, hypers
-        )
+        log_prob = policy.distribution.log_prob(output.policy, action)
+        scored = ScoredStep(observation, action, log_prob, output.value, output.vex)
+        filter_state, decided = parts.filter.keep(carry.filter, scored, filter_key, hypers)
         keep = decided & acting
     envs, told = advance(parts.env, state.envs, action, acting, env_key, parts.anywhere)
     moments = state.observation_moments

@@ -25,7 +25,7 @@ from sauna.algorithm.rollout.actor import make_actor
 from sauna.algorithm.rollout.collected import Collected, Episode, capacity
 from sauna.algorithm.rollout.moments import ObservationMoments, discounted_returns
 from sauna.algorithm.rollout.program import Program
-from sauna.algorithm.types import Hypers, Keys, Rollout
+from sauna.algorithm.types import Hypers, Keys, Rollout, ScoredStep
 from sauna.envs.host.contract import HostEnvs, Step
 from sauna.envs.spaces import Spaces
 
@@ -166,9 +166,10 @@ class HostCollector:
                 np.zeros((size, *buffer.shape[2:]), buffer.dtype)
                 for buffer in (self._buffers.observation, self._buffers.action)
             )
-            vex = np.asarray(self._program.score(params, observation, action))[..., 2]
+            scores = np.asarray(self._program.score(params, observation, action))
+            steps = ScoredStep(observation, action, *(scores[..., i] for i in range(3)))
             none = np.int32(0)
-            self._program.decide(filters[0], observation, vex, none, none, key, hypers)
+            self._program.decide(filters[0], steps, none, none, key, hypers)
         self._uncompiled = False
 
     def _plan(self, member: int, t: int, limit: np.ndarray) -> _Stretch:
@@ -288,8 +289,9 @@ class HostCollector:
             return
         filters[member], mask = self._program.decide(
             filters[member],
-            self._padded(buffers.observation[member, rows]),
-            self._padded(buffers.vex[member, rows]),
+            ScoredStep(
+                *(self._padded(getattr(buffers, n)[member, rows]) for n in ScoredStep._fields)
+            ),
             np.int32(first),
             np.int32(last - first),
             keys[member],

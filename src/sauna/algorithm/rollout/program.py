@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from sauna.algorithm.policy.policy import Policy, act, make_policy, score
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.types import Array, Filter, Hypers
+from sauna.algorithm.types import Array, Hypers, ScoredStep, StepFilter
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 
@@ -26,7 +26,7 @@ class Program(NamedTuple):
 
     config: Config
     policy: Policy
-    filter: Filter | None
+    filter: StepFilter | None
     draw: Callable[[Array, Any, Any], Array]
     act: Callable[[Array, Any, Any], Array]
     score: Callable[[Any, Any, Any], Array]
@@ -72,32 +72,32 @@ def _nothing_to_decide(*arguments: Any) -> tuple[Any, Array]:
 
 
 def decide(
-    filter: Filter,
+    filter: StepFilter,
     state: Any,
-    observation: Array,
-    vex: Array,
+    steps: ScoredStep,
     first: Array,
     length: Array,
     key: Array,
     hypers: Hypers,
 ) -> tuple[Any, Array]:
-    """Runs a filter over a stretch of consecutive env steps.
+    """Runs a filter over a segment of consecutive env steps.
 
     Args:
-      observation: `[L, N, ...]`; `vex`: `[L, N]`, of which the first `length` rows count.
-      first: index of the stretch's first step within the rollout.
+      steps: fields `[L, N, ...]`, of which the first `length` rows count.
+      first: index of the segment's first step within the rollout.
       key: the rollout's filter key; step t uses `fold_in(key, t)`.
 
     Returns:
-      the filter's state after the stretch, and the mask `[L, N]` (False behind `length`).
+      the filter's state after the segment, and the mask `[L, N]` (False behind `length`).
     """
 
     def step(carry: tuple[Array, Any, Array]) -> tuple[Array, Any, Array]:
         t, state, mask = carry
         step_key = jax.random.fold_in(key, first + t)
-        state, kept = filter.keep(state, observation[t], vex[t], step_key, hypers)
+        now = jax.tree.map(lambda x: x[t], steps)
+        state, kept = filter.keep(state, now, step_key, hypers)
         return t + 1, state, mask.at[t].set(kept)
 
-    start = (jnp.int32(0), state, jnp.zeros(vex.shape, bool))
+    start = (jnp.int32(0), state, jnp.zeros(steps.vex.shape, bool))
     _, state, mask = jax.lax.while_loop(lambda carry: carry[0] < length, step, start)
     return state, mask

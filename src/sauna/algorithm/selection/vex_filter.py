@@ -1,18 +1,7 @@
-"""Filters: which transitions of a rollout the update keeps.
+"""SAUNA's filter: keep a transition if its predicted explained variance is informative (eq. 7).
 
-A filter is a pair of pure functions. `init(num_envs, capacity)` gives the state at the start of a
-rollout in which each env acts at most `capacity` times. `keep(state, observation, vex, key,
-hypers)` is called once per env step, in time order:
-
-  observation  [N, ...]  what the policy saw
-  vex          [N]       the Vex head's prediction there
-  key                    a JAX key of this step alone
-  hypers                 traced hyperparameters, of which `threshold` and `drop_rate` are filters'
-
-and returns the new state and the mask `[N]` of the envs whose transition is kept. An env whose
-quota is already full still has a row; its decision is ignored. Deciding never changes how an env
-acts, so a filter may be run over a stretch of steps after they happened: the host does that, the
-device decides step by step, and both get the same mask.
+Deciding never changes how an env acts, so that a filter may be run over a segment of steps after
+they happened: the host does that, the device decides step by step, and both get the same mask.
 """
 
 from __future__ import annotations
@@ -23,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.selection.history import History, empty_history, insert, median, quantile
-from sauna.algorithm.types import Array, Filter, Hypers, Rollout
+from sauna.algorithm.types import Array, Hypers, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 
 EPSILON = 1e-8  # epsilon_0 of eq. 7
@@ -39,7 +28,7 @@ def informative(vex: Array, history: History, threshold: Array) -> Array:
     return (history.number == 0) | ~(ratio < threshold)
 
 
-def sauna_per_env(history: str, quota: int) -> Filter:
+def sauna_per_env(history: str, quota: int) -> StepFilter:
     """Eq. 7 for each env by itself.
 
     Args:
@@ -50,11 +39,9 @@ def sauna_per_env(history: str, quota: int) -> Filter:
     def init(num_envs: int, capacity: int) -> History:
         return empty_history((num_envs,), quota if history == "kept" else capacity)
 
-    def keep(
-        state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
-    ) -> tuple[History, Array]:
-        mask = informative(vex, state, hypers.threshold)
-        seen = insert(state, vex)
+    def keep(state: History, step: ScoredStep, key: Array, hypers: Hypers) -> tuple[History, Array]:
+        mask = informative(step.vex, state, hypers.threshold)
+        seen = insert(state, step.vex)
         if history == "kept":
             seen = History(
                 jnp.where(mask[:, None], seen.ordered, state.ordered),
@@ -62,10 +49,10 @@ def sauna_per_env(history: str, quota: int) -> Filter:
             )
         return seen, mask
 
-    return Filter(init, keep)
+    return StepFilter(init, keep)
 
 
-def sauna_joint(history: str, quota: int) -> Filter:
+def sauna_joint(history: str, quota: int) -> StepFilter:
     """Eq. 7 for a vector step as a whole, as the released code does; see `sauna_per_env`.
 
     `runner.py` of the authors' release compares |mean over envs| with the median of all envs'
@@ -75,16 +62,15 @@ def sauna_joint(history: str, quota: int) -> Filter:
     def init(num_envs: int, capacity: int) -> History:
         return empty_history((), num_envs * (quota if history == "kept" else capacity))
 
-    def keep(
-        state: History, observation: Array, vex: Array, key: Array, hypers: Hypers
-    ) -> tuple[History, Array]:
+    def keep(state: History, step: ScoredStep, key: Array, hypers: Hypers) -> tuple[History, Array]:
+        vex = step.vex
         kept = informative(jnp.mean(vex), state, hypers.threshold)
         seen = jax.lax.fori_loop(0, len(vex), lambda n, history: insert(history, vex[n]), state)
         if history == "kept":
             seen = jax.tree.map(lambda new, old: jnp.where(kept, new, old), seen, state)
         return seen, jnp.broadcast_to(kept, vex.shape)
 
-    return Filter(init, keep)
+    return StepFilter(init, keep)
 
 
 class Held(NamedTuple):
@@ -97,7 +83,7 @@ class Held(NamedTuple):
 SETTLE = 50  # env steps within which a deviation of the keep rate is made good
 
 
-def sauna_at_rate(rate: float) -> Filter:
+def sauna_at_rate(rate: float) -> StepFilter:
     """Eq. 7 with a threshold that is moved at every step so that the share `rate` is kept.
 
     Comparing `|x| / |median|` with a threshold is comparing `|x|` with some quantile of the earlier
@@ -115,14 +101,12 @@ def sauna_at_rate(rate: float) -> Filter:
     def init(num_envs: int, capacity: int) -> Held:
         return Held(empty_history((num_envs,), capacity), jnp.zeros(num_envs, jnp.int32))
 
-    def keep(
-        state: Held, observation: Array, vex: Array, key: Array, hypers: Hypers
-    ) -> tuple[Held, Array]:
-        size = jnp.abs(vex)
+    def keep(state: Held, step: ScoredStep, key: Array, hypers: Hypers) -> tuple[Held, Array]:
+        size = jnp.abs(step.vex)
         mask = ~(size < held_edge(state, rate)) | (hypers.threshold <= 0)
         return Held(insert(state.history, size), state.kept + mask), mask
 
-    return Filter(init, keep)
+    return StepFilter(init, keep)
 
 
 def held_edge(state: Held, rate: float) -> Array:

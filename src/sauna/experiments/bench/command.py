@@ -29,18 +29,17 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
-_FIELDS = [*FIELDS]
 # The settings of environment and learning, which a trainer without filters has as well.
-_LEARNING = (
-    "env_kwargs",
-    "truncation",
-    *_FIELDS[_FIELDS.index("envs") : _FIELDS.index("clip_rewards") + 1],
+_LEARNING = tuple(
+    name
+    for name, field in FIELDS.items()
+    if field.metadata["group"] in ("task", "learning", "network", "normalisation") and name != "env"
 )
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 
 
 def bench(
-    given: Mapping[str, Any],
+    overrides: Mapping[str, Any],
     *,
     iterations: int,
     rounds: int,
@@ -48,7 +47,7 @@ def bench(
     script: Path | None,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Measures training with the settings `given` on this machine.
+    """Measures training with these settings on this machine.
 
     Args:
       iterations: of each round's training, beyond the warm-up.
@@ -62,13 +61,13 @@ def bench(
     Raises:
       BadInput: the settings or the peer are not usable.
     """
-    given = plain(given)
-    config = resolve(given)
+    overrides = plain(overrides)
+    config = resolve(overrides)
     processes = config.processes or os.cpu_count() or 1
     processes = min(processes, len(config.seeds) * len(config.arm))
     batch = config.rollout_steps * config.envs
-    given |= {"steps": batch * (iterations + WARM_UP), "processes": processes}
-    measures = {"training": lambda: training_rate(given)}
+    overrides |= {"steps": batch * (iterations + WARM_UP), "processes": processes}
+    measures = {"training": lambda: training_rate(overrides)}
     if simulator(config.env):
         kwargs = json.loads(config.env_kwargs)
         measures["physics"] = lambda: physics_rate(config.env, kwargs, processes, SECONDS / 3)
@@ -83,7 +82,7 @@ def bench(
         "git": run_directory.git_revision(),
     }
     if against:
-        _check_peer(config, given, against)
+        _check_peer(config, overrides, against)
         python = prepare(against, say)
         measures[against] = partial(
             peer_rate, python, script, config.env, config.algorithm, processes, SECONDS
@@ -97,12 +96,12 @@ def bench(
     }
     say("where the time goes, in one process")
     share = -(-result["members"] // processes)
-    result["split"] = _split_elsewhere({**given, "steps": batch * 100}, share)
-    result |= start_and_memory(given)
+    result["split"] = _split_elsewhere({**overrides, "steps": batch * 100}, share)
+    result |= start_and_memory(overrides)
     return result
 
 
-def _check_peer(config: Config, given: Mapping[str, Any], against: str) -> None:
+def _check_peer(config: Config, overrides: Mapping[str, Any], against: str) -> None:
     """Refuses settings of learning that a peer, which has those of one preset, would not read.
 
     Arms and filters are not among them: what they cost beside a peer's PPO is a fair question.
@@ -120,50 +119,50 @@ def _check_peer(config: Config, given: Mapping[str, Any], against: str) -> None:
             f"{config.preset}"
         )
     usual = arm_config("ppo", {"preset": preset})
-    for name in (name for name in given if name in _LEARNING):
+    for name in (name for name in overrides if name in _LEARNING):
         if getattr(config, name) != getattr(usual, name):
             raise BadInput(f"{name}: not read by {against}, which runs the preset {preset}")
 
 
 def bench_scale(
-    given: Mapping[str, Any], rounds: int, say: Callable[[str], None]
+    overrides: Mapping[str, Any], rounds: int, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """The rate against members, environments, width and processes, with the machine named.
 
     Raises:
       BadInput: the settings are not usable.
     """
-    given = plain(given)
-    config = resolve(given)
+    overrides = plain(overrides)
+    config = resolve(overrides)
     return {
         "env": config.env,
         "arm": list(config.arm),
         "machine": run_directory.machine(),
         "versions": run_directory.versions(),
         "git": run_directory.git_revision(),
-        "scale": scale(given, rounds, say),
+        "scale": scale(overrides, rounds, say),
     }
 
 
-def _split_elsewhere(given: Mapping[str, Any], share: int) -> dict[str, float]:
+def _split_elsewhere(overrides: Mapping[str, Any], share: int) -> dict[str, float]:
     """`split` in a process that is set up as a training worker is."""
     code = (
         "import json, sys; from sauna.training.worker import configure_jax; configure_jax(); "
         "from sauna.experiments.bench.split import split; "
         "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))"
     )
-    command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(given), str(share)]
+    command = [sys.executable, "-W", "ignore", "-c", code, json.dumps(overrides), str(share)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
-def start_and_memory(given: Mapping[str, Any]) -> dict[str, float]:
+def start_and_memory(overrides: Mapping[str, Any]) -> dict[str, float]:
     """Seconds from the command to the end of the first iteration, and the memory of one process.
 
     A second run of the same settings, so that the compilation cache is warm. The first env step
     comes before the first row does; the time told is the later one.
     """
-    values = dict(given)
+    values = dict(overrides)
     values["steps"] = resolve(values).rollout_steps * resolve(values).envs * 2
     with tempfile.TemporaryDirectory() as folder:
         settings = Path(folder) / "settings.json"

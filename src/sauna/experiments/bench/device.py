@@ -16,13 +16,13 @@ from functools import partial
 from statistics import median
 from typing import Any
 
-from sauna.config.presets import members, plain, resolve
+from sauna.config.presets import plain, resolve, resolve_run
 from sauna.config.settings import Config
 from sauna.experiments.bench.rates import ratio
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
-from sauna.training.prepare import MOST_STEPS, look_at, placed, settle
+from sauna.training.prepare import MAX_STEPS, examine, place
 
 # Numbers of environments that `--scale` tries, and of members.
 ENVS = {"cpu": (8, 32, 128), "gpu": (256, 512, 1024, 2048, 4096, 8192, 16384)}
@@ -30,7 +30,7 @@ MEMBERS = {"cpu": (1, 4, 16), "gpu": (1, 4, 16, 64)}
 
 
 def bench_on_device(
-    given: Mapping[str, Any],
+    overrides: Mapping[str, Any],
     *,
     iterations: int,
     rounds: int,
@@ -45,18 +45,18 @@ def bench_on_device(
     Raises:
       BadInput: the settings or the peer are not usable.
     """
-    given = _given(given, 100 * iterations)
-    config = placed(resolve(given))
+    overrides = _on_device(overrides, 100 * iterations)
+    config = place(resolve_run(overrides)).config
     if against and against != "brax":
         raise BadInput(f"against: {against} has no environments on the device; brax has")
     if against:
         _check_peer(config)
     measures: dict[str, Callable[[], dict[str, float]]] = {
-        "sauna": lambda: _elsewhere("sauna.experiments.bench.device", given, iterations)
+        "sauna": lambda: _elsewhere("sauna.experiments.bench.device", overrides, iterations)
     }
     if against:
         measures["brax"] = lambda: _elsewhere(
-            "sauna.experiments.bench.peer_brax", given, iterations
+            "sauna.experiments.bench.peer_brax", overrides, iterations
         )
     found: list[dict[str, float]] = []
     for number in range(rounds):
@@ -108,14 +108,14 @@ def _check_peer(config: Config) -> None:
 _APART = ("compile_seconds", "peak_memory_mib")  # of a round, and not a rate
 
 
-def _given(given: Mapping[str, Any], iterations: int) -> dict[str, Any]:
-    given = plain({"backend": "device", **given})
+def _on_device(overrides: Mapping[str, Any], iterations: int) -> dict[str, Any]:
+    overrides = plain({"backend": "device", **overrides})
     for name in ("processes", "distributed"):
-        if name in given:
+        if name in overrides:
             raise BadInput(f"{name}: not read by a benchmark on the device, which is one process")
-    config = resolve({**given, "steps": MOST_STEPS})  # room for a rollout of any size
+    config = resolve({**overrides, "steps": MAX_STEPS})  # room for a rollout of any size
     steps = config.rollout_steps * config.envs * iterations
-    return {**given, "steps": min(steps, MOST_STEPS // config.max_env_steps_factor)}
+    return {**overrides, "steps": min(steps, MAX_STEPS // config.max_env_steps_factor)}
 
 
 def _told(round_: Mapping[str, float], name: str) -> str:
@@ -123,8 +123,8 @@ def _told(round_: Mapping[str, float], name: str) -> str:
     return ", ".join(f"{part} {round_[part]:,.0f}" for part in wanted) + " env steps/s"
 
 
-def _elsewhere(module: str, given: Mapping[str, Any], iterations: int) -> dict[str, float]:
-    command = [sys.executable, "-W", "ignore", "-m", module, json.dumps(given), str(iterations)]
+def _elsewhere(module: str, overrides: Mapping[str, Any], iterations: int) -> dict[str, float]:
+    command = [sys.executable, "-W", "ignore", "-m", module, json.dumps(overrides), str(iterations)]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
@@ -142,14 +142,14 @@ def device_name(config: Config) -> str:
 
 
 def scale_on_device(
-    given: Mapping[str, Any], rounds: int, iterations: int, say: Callable[[str], None]
+    overrides: Mapping[str, Any], rounds: int, iterations: int, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Rates against the number of environments and of members, with the machine named.
 
     Raises:
       BadInput: the settings are not usable.
     """
-    config = placed(resolve(_given({**given, "seeds": 1}, 1)))
+    config = place(resolve_run(_on_device({**overrides, "seeds": 1}, 1))).config
     points = [("envs", n, {"envs": n, "seeds": 1}) for n in ENVS[config.device]]
     points += [("members", n, {"seeds": n}) for n in MEMBERS[config.device]]
     found: dict[str, dict[int, list[dict[str, float]]]] = {"envs": {}, "members": {}}
@@ -157,7 +157,7 @@ def scale_on_device(
         for axis, value, settings in points:
             each = _elsewhere(
                 "sauna.experiments.bench.device",
-                _given({**given, **settings}, 100 * iterations),
+                _on_device({**overrides, **settings}, 100 * iterations),
                 iterations,
             )
             found[axis].setdefault(value, []).append(each)
@@ -179,19 +179,17 @@ def scale_on_device(
     }
 
 
-def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
+def measure(overrides: Mapping[str, Any], iterations: int) -> dict[str, float]:
     """One round, in this process."""
-    config = placed(resolve(given))
+    placed = place(resolve_run(overrides))
+    config = placed.config
     configure_jax(config.devices if config.device == "cpu" else 0, config.device)
     import jax
 
     from sauna.training.loop.device import make_population
-    from sauna.training.loop.job import Job
 
-    found = look_at(config)
-    config = settle(config, found.spaces)
-    kwargs = json.loads(config.env_kwargs)
-    job = Job(config, found.spaces, kwargs, members(config, given), [], None, 0, True)
+    job = examine(placed, overrides).job()
+    config = job.config
     population = make_population(job)
     compile_seconds = population.compile()
     population.run(0, 1)
@@ -203,11 +201,11 @@ def measure(given: Mapping[str, Any], iterations: int) -> dict[str, float]:
 
 def _whole(population: Any, iterations: int) -> float:
     """Env steps per second of that many whole iterations, a device's call of them at a time."""
-    from sauna.training.loop.device_program import MOST_PER_CALL
+    from sauna.training.loop.device_program import MAX_PER_CALL
 
     first, steps, clock = 1, 0, time.perf_counter()
     while first <= iterations:
-        number = min(MOST_PER_CALL, iterations + 1 - first)
+        number = min(MAX_PER_CALL, iterations + 1 - first)
         reports = population.run(first, number)
         steps += sum(int(report.env_steps[report.ran].sum()) for report in reports)
         first += number

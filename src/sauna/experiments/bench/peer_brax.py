@@ -12,15 +12,15 @@ import sys
 import time
 from typing import Any
 
-from sauna.config.presets import resolve
+from sauna.config.presets import resolve_run
 from sauna.system.jax_setup import configure_jax
-from sauna.training.prepare import placed
+from sauna.training.prepare import place
 
 EPOCHS = 4  # the first holds the compilation
 
 
-def rate(given: dict[str, Any], iterations: int) -> float:
-    config = placed(resolve(given))
+def rate(overrides: dict[str, Any], iterations: int) -> float:
+    config = place(resolve_run(overrides)).config
     configure_jax(0, config.device)
     import jax
 

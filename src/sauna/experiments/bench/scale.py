@@ -38,7 +38,7 @@ def settings_at(axis: str, value: int) -> dict[str, Any]:
 
 
 def scale(
-    given: Mapping[str, Any], rounds: int, say: Callable[[str], None]
+    overrides: Mapping[str, Any], rounds: int, say: Callable[[str], None]
 ) -> dict[str, list[dict[str, Any]]]:
     """Env steps per second at every point of each axis, all of them once per round.
 
@@ -54,7 +54,7 @@ def scale(
     for number in range(rounds):
         for axis, values in points.items():
             for value in values:
-                rate = _rate({**given, **settings_at(axis, value)})
+                rate = _rate({**overrides, **settings_at(axis, value)})
                 rates.setdefault((axis, value), []).append(rate)
                 text = f"round {number + 1} of {rounds}: {value} {LABELS[axis]}"
                 say(f"{text}: {rate:,.0f} env steps/s")

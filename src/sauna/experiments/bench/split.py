@@ -21,17 +21,15 @@ from sauna.algorithm.learner.program import Learner, make_learner
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
-from sauna.algorithm.types import TrainState, member_keys
-from sauna.config.presets import members, resolve
+from sauna.algorithm.types import TrainState, member_keys, selection_key
 from sauna.envs.host import mujoco_tasks
 from sauna.envs.host.atari_envs import AtariEnvs
 from sauna.envs.host.mujoco_tasks import BatchTask
-from sauna.envs.probe import probe
 from sauna.system.checkpoint import save_checkpoint
 from sauna.training.loop import budget, host
 from sauna.training.loop.member_state import Counters
 from sauna.training.loop.metrics import metrics_row
-from sauna.training.prepare import settle
+from sauna.training.prepare import prepare
 
 SECTIONS = (
     "physics",
@@ -92,21 +90,17 @@ class Timers:
 
 def split(settings: dict[str, Any], count: int) -> dict[str, float]:
     """Microseconds per env step in each section, for `count` members in this process."""
-    given = {**settings, "seeds": count, "processes": 1}
-    config = resolve(given)
-    kwargs = json.loads(config.env_kwargs)
-    found = probe(config.env, kwargs)
-    config = settle(config, found.spaces)
-    job = host.Job(config, found.spaces, kwargs, members(config, given), [], None, 0, True)
+    job = prepare({**settings, "seeds": count, "processes": 1}).job()
+    config = job.config
     timers = Timers()
     cost = timers.calibrate()
-    program = make_program(config, found.spaces)
-    learner = _timed(make_learner(config, program.policy), LEARNING, timers)
+    program = make_program(config, job.spaces)
+    learner = _timed(make_learner(config, program.policy, job.spaces), LEARNING, timers)
     acting = {k: v for k, v in ACTING.items() if k != "decide" or program.filter is not None}
     program = _timed(program, acting, timers)
     envs = host.make_envs(job)
     keys = [member_keys(member.seed) for member in job.members]
-    collector = HostCollector(program, found.spaces, envs, keys)
+    collector = HostCollector(program, job.spaces, envs, keys)
     restore = _wrap_host(collector, envs, timers)
     try:
         steps, seconds, states, counters = _train(job, learner, collector, timers)
@@ -180,7 +174,14 @@ def _train(
         collected = collector.collect(params, hypers, iteration, limit)
         for p, member in enumerate(job.members):
             order = minibatch_order(job.config, member.seed, iteration)
-            states[p], learned = host._learn(learner, states[p], collected[p], hypers[p], order)
+            states[p], learned = host._learn(
+                learner,
+                states[p],
+                collected[p],
+                hypers[p],
+                order,
+                selection_key(keys[p], iteration),
+            )
             counters[p].add(collected[p])
             steps += collected[p].env_steps
             log(member, job.config, iteration, collected[p], counters[p], learned, hypers[p])

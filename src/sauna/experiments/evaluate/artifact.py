@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna.config.presets import stored_config
+from sauna.config.presets import RunConfig
 from sauna.config.settings import Config
+from sauna.config.stored import read_stored
 from sauna.config.trust import check_trusted
 from sauna.envs.spaces import Spaces, describe, difference, read_spaces
 from sauna.system import checkpoint, run_directory
@@ -18,10 +19,15 @@ from sauna.system.logs import check_logs
 class Artifact(NamedTuple):
     """A checkpoint of a run and what it is of."""
 
-    config: Config
+    run: RunConfig
     spaces: Spaces
     members: list[str]
     checkpoint: checkpoint.Checkpoint
+
+    @property
+    def config(self) -> Config:
+        """What all members share."""
+        return self.run.config
 
 
 def load_artifact(
@@ -49,8 +55,7 @@ def load_artifact(
         spaces = read_spaces(loaded.manifest["spaces"])
     except (TypeError, ValueError, LookupError) as error:
         raise checkpoint.BadCheckpoint(f"{loaded.path}: its spaces cannot be read") from error
-    config = stored_config(loaded.manifest["config"])
-    return Artifact(config, spaces, loaded.manifest["members"], loaded)
+    return Artifact(read_stored(loaded.manifest), spaces, loaded.manifest["members"], loaded)
 
 
 def _newest(run: Path, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:

@@ -19,7 +19,7 @@ from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.selection.history import History, median
 from sauna.algorithm.selection.registry import make_filter
 from sauna.algorithm.selection.vex_filter import EPSILON, Held, held_edge
-from sauna.algorithm.types import Array, Filter, Hypers, Rollout
+from sauna.algorithm.types import Array, Hypers, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 
 
@@ -64,39 +64,37 @@ def standards(config: Config, state: Any, hypers: Hypers) -> tuple[Array, Array]
 @partial(jax.jit, static_argnames=("config", "filter"))
 def trace(
     config: Config,
-    filter: Filter,
+    filter: StepFilter,
     state: Any,
-    observation: Array,
-    vex: Array,
+    steps: ScoredStep,
     key: Array,
     hypers: Hypers,
 ) -> tuple[Array, tuple[Array, Array]]:
-    """The mask `[S, N]` of `selection.filters.decide`, and the `standards` before each step.
+    """The mask `[S, N]` of `rollout.program.decide`, and the `standards` before each step.
 
     Args:
-      observation: `[S, N, *obs]`; vex: `[S, N]`.
+      steps: fields `[S, N, ...]`.
     """
 
-    def step(state: Any, row: tuple[Array, Array, Array]) -> tuple[Any, Any]:
-        t, seen, x = row
+    def step(state: Any, row: tuple[Array, ScoredStep]) -> tuple[Any, Any]:
+        t, now = row
         before = standards(config, state, hypers)
-        state, kept = filter.keep(state, seen, x, jax.random.fold_in(key, t), hypers)
+        state, kept = filter.keep(state, now, jax.random.fold_in(key, t), hypers)
         return state, (kept, before)
 
-    rows = (jnp.arange(len(vex)), observation, vex)
+    rows = (jnp.arange(len(steps.vex)), steps)
     return jax.lax.scan(step, state, rows)[1]
 
 
-def decide(
-    config: Config, observation: np.ndarray, vex: np.ndarray, key: Any, hypers: Hypers
-) -> Decisions:
+def decide(config: Config, scored: ScoredStep, key: Any, hypers: Hypers) -> Decisions:
     """Rollout after rollout; what is kept is environment 0's.
 
     Args:
       config: the member's own.
-      observation: `[L, N, *obs]`; vex: `[L, N]`.
+      scored: fields `[L, N, ...]`.
       key: rollout r draws from `fold_in(key, r)`.
     """
+    vex: Any = scored.vex
     filter, steps, room = make_filter(config), len(vex), capacity(config)
     joint = config.filter == "sauna" and config.decision == "joint"
     prediction = vex.mean(1) if joint else vex[:, 0]
@@ -110,10 +108,10 @@ def decide(
     start = 0
     longest = min(room, steps)
     while start < steps:
-        rows = [_stretch(x, start, longest) for x in (observation, vex)]
+        rows = ScoredStep(*(_stretch(x, start, longest) for x in scored))
         rollout_key = jax.random.fold_in(key, len(rollouts))
         first = filter.init(vex.shape[1], room)
-        mask, standard = trace(config, filter, first, *rows, rollout_key, hypers)
+        mask, standard = trace(config, filter, first, rows, rollout_key, hypers)
         own = np.asarray(mask)[:, 0]
         full = np.flatnonzero(np.cumsum(own) == config.rollout_steps)
         tried = min(int(full[0]) + 1 if len(full) else longest, steps - start)

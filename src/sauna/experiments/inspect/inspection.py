@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from sauna.algorithm.policy.normalize import Moments, scale_rewards
-from sauna.algorithm.types import Hypers, Rollout, member_keys
-from sauna.config.presets import Member, as_began, members
+from sauna.algorithm.types import Hypers, Rollout, ScoredStep, member_keys
+from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.envs.make import make_env
 from sauna.experiments.evaluate.artifact import Artifact
@@ -62,7 +62,7 @@ def examine(
 ) -> Inspection:
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
-    everyone = members(artifact.config, as_began(manifest["config"], manifest["given"]))
+    everyone = artifact.run.members
     member = next((one for one in everyone if one.name == name), None)
     if member is None:
         raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
@@ -84,7 +84,10 @@ def examine(
     value, own_vex = policy.predict(played.observation)
     vex = np.stack([own_vex, *(policy.predict(x)[1] for x in seen[1:])], 1)
     key = jax.random.fold_in(member_keys(member.seed).filter, iteration)
-    decisions = decide(config, np.stack(seen, 1), vex, key, hypers)
+    none: Any = np.zeros(vex.shape, np.float32)
+    observed: Any = np.stack(seen, 1)
+    scored = ScoredStep(observed, none[..., None], none, none, vex)
+    decisions = decide(config, scored, key, hypers)
     reward = scaled(config, own, played.reward)
     stream = _stream(policy, played, reward, value, decisions.keep)
     points, shares = principal_components(played.observation)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.ppo import standardize, surrogate, weighted_mean
+from sauna.algorithm.learner.losses import standardize, weighted_mean
+from sauna.algorithm.learner.ppo import surrogate
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.types import Array
 

@@ -22,8 +22,9 @@ from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
 from sauna.algorithm.types import Array, Hypers, Rollout, member_keys
-from sauna.config.presets import Member, as_began, members, stored_config
+from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.config.stored import read_stored
 from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
@@ -83,10 +84,9 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
     stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust=False)
-    config = stored_config(loaded.manifest["config"])
+    settings = read_stored(loaded.manifest)
     spaces = read_spaces(loaded.manifest["spaces"])
-    given = as_began(loaded.manifest["config"], loaded.manifest["given"])
-    everyone = members(config, given)
+    config, everyone = settings.config, settings.members
     place = next((p for p, member in enumerate(everyone) if member.name == name), None)
     if place is None:
         raise BadCheckpoint(f"{loaded.path}: its config has no member {name!r}")

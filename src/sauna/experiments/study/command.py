@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import algorithm_of, chosen_preset
+from sauna.config.presets import COMPARED_SEEDS, algorithm_of, chosen_preset
 from sauna.config.settings import Config
 from sauna.config.trust import check_trusted, covers, seal
 from sauna.envs.probe import Probe
@@ -22,8 +22,9 @@ from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
 from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
+from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
-from sauna.experiments.study.spec import Spec, check, load_spec, read_spec
+from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
 from sauna.experiments.study.summary import FILTERING, summarize
 from sauna.experiments.study.units import (
     Unit,
@@ -37,9 +38,7 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
 from sauna.system.working_folder import kept_folder
-from sauna.training.prepare import check_read_after_settling, look_at, placed, settle
-
-SEEDS = 6  # of a comparison, where none are given
+from sauna.training.prepare import examine, look_at, place
 
 
 def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
@@ -54,7 +53,7 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     algorithm = algorithm_of(chosen_preset(settings))
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
     entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
-    values = {"tasks": [env], "arms": entries, "seeds": SEEDS, **rules, **settings}
+    values = {"tasks": [env], "arms": entries, "seeds": COMPARED_SEEDS, **rules, **settings}
     spec = read_spec({"name": "compare", **values})
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
     name = f"compare_{place}_{digest_of(study_identity(spec))}"
@@ -140,17 +139,16 @@ def _check_runs(spec: Spec) -> None:
     found: dict[tuple[str, ...], Probe] = {}
     for arm in spec.arms:
         for task in arm.tasks:
-            config = placed(check(arm, task))
+            placed = place(resolved(arm, task))
+            config = placed.config
             if spec.measure and config.backend == "device":
                 raise BadInput(f"backend: measure needs environments on the host, not {task}")
             key = task, config.env_kwargs, config.backend
             if key not in found:
                 found[key] = look_at(config)
             try:
-                settled = settle(config, found[key].spaces)
-                given = {**arm.given(task, arm.seeds), "drop_rate_from": settled.drop_rate_from}
-                check_read_after_settling(found[key].spaces, settled, given)
-                _check_measurable(spec, settled, found[key].spaces)
+                prepared = examine(placed, arm.checked_overrides(task), found[key])
+                _check_measurable(spec, prepared.config, prepared.spaces)
             except BadInput as error:
                 raise BadInput(f"arm {arm.label!r}: {error}") from None
 
@@ -171,7 +169,7 @@ def _check_measurable(spec: Spec, config: Config, spaces: Spaces) -> None:
 
 def _on_gpu(spec: Spec) -> bool:
     """Whether some run takes a whole GPU, which others would only slow down."""
-    configs = (placed(check(arm, task)) for arm in spec.arms for task in arm.tasks)
+    configs = (place(resolved(arm, task)).config for arm in spec.arms for task in arm.tasks)
     return any(config.backend == "device" and config.device == "gpu" for config in configs)
 
 
@@ -199,6 +197,8 @@ def _train(
             f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
             f"writing to {place}"
         )
+        for note in before_training(spec):
+            view.say(note)
         noted: list[int] = []
         with handled(partial(_note_signal, noted)):
             view.open()

@@ -22,7 +22,6 @@ own `tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured dr
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import string
@@ -32,12 +31,20 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sauna.config.presets import ARMS, DECIDED, FIXED, SHARED_RULES, arm_config, parse_all, resolve
-from sauna.config.settings import FIELDS, Config, check_read, parse, to_json
+from sauna.config.checks import is_read
+from sauna.config.presets import (
+    FIXED,
+    RunConfig,
+    arm_config,
+    arm_settings,
+    parse_all,
+    resolve_run,
+)
+from sauna.config.settings import FIELDS, Config, fields_with, parse, to_json
 from sauna.system.errors import BadInput, nearest
 from sauna.system.safe_read import JSON_BYTES, Untrusted, read_file
 
-_OWN = (*DECIDED, "seeds")
+_OWN = (*fields_with("decided_by_study"), "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
 MEASURES = ("noise", "dial", "torso")
@@ -55,9 +62,14 @@ class Arm(NamedTuple):
     baseline: str | None  # the label it is compared with
     rates_of: str | None  # the label whose drop rates it repeats
 
-    def given(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
-        """The settings of a run of some seeds on one task."""
+    def overrides(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
+        """Gives the settings of a run of some seeds on one task."""
         return {**self.settings, "env": task, "arm": self.arm, "seeds": list(seeds)}
+
+    def checked_overrides(self, task: str) -> dict[str, Any]:
+        """Gives the settings of all seeds, with a stand-in for a source that is not there yet."""
+        source = {"drop_rate_from": "the source"} if self.rates_of is not None else {}
+        return {**self.overrides(task, self.seeds), **source}
 
 
 class Spec(NamedTuple):
@@ -122,8 +134,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
             known = [*_ARM, *(name for name in FIELDS if name not in _OWN)]
             raise BadInput(f"study: unknown key {key!r} in an arm{nearest(key, known)}")
     arm = _text(entry.get("arm", entry.get("label")), "arm")
-    if arm not in ARMS:
-        raise BadInput(f"study: unknown arm {arm!r} (known: {', '.join(ARMS)}){nearest(arm, ARMS)}")
+    arm_settings(arm)
     tasks = entry.get("tasks", top.get("tasks"))
     if not isinstance(tasks, list) or not tasks or len(set(map(str, tasks))) < len(tasks):
         raise BadInput("study: tasks must be a list of environments, each of them once")
@@ -146,12 +157,8 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
 
 def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
     """Whether a run of `arm` with these settings takes the setting `key` at all."""
-    config = dataclasses.replace(arm_config(arm, parse_all(settings)), arm=(arm,))
-    try:
-        check_read([config], {key: None})
-    except BadInput:
-        return False
-    return key not in FIXED.get(arm, ())
+    config = arm_config(arm, parse_all(settings))
+    return is_read(key, config) and key not in FIXED.get(arm, ())
 
 
 def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
@@ -212,7 +219,7 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
     known = {other.label: other for other in arms}
     source = arm.rates_of
     if arm.arm == "random-drop" and source is None and "drop_rate" not in arm.settings:
-        filtered = [a.label for a in arms if ARMS[a.arm]["filter"] == "sauna"]
+        filtered = [a.label for a in arms if arm_settings(a.arm)["filter"] == "sauna"]
         if not filtered:
             raise BadInput("study: random-drop needs a filtered arm whose rates it repeats")
         source = filtered[0]
@@ -230,7 +237,7 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
             f"{', '.join(sorted(missing))}"
         )
     if source is not None:
-        if ARMS[known[source].arm]["filter"] != "sauna":
+        if arm_settings(known[source].arm)["filter"] != "sauna":
             raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")
         if set(arm.tasks) - set(known[source].tasks) or arm.seeds != known[source].seeds:
             raise BadInput(f"study: {source!r} must have the tasks and the seeds of {arm.label!r}")
@@ -241,7 +248,8 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
 def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
     """The rules of a filtered arm that a coin which repeats its drop rates has to share."""
     theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, coin))
-    rules = {name: theirs[name] for name in SHARED_RULES if name not in FIXED[coin.arm]}
+    shared = fields_with("rule_of_experiment")
+    rules = {name: theirs[name] for name in shared if name not in FIXED[coin.arm]}
     return {
         name: theirs[name]
         for name in rules
@@ -250,16 +258,18 @@ def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
 
 
 def check(arm: Arm, task: str) -> Config:
-    """The config of a run of `arm`; a random-drop arm's source is settled later.
+    """Resolves the config of a run of `arm`; see `resolved`."""
+    return resolved(arm, task).config
+
+
+def resolved(arm: Arm, task: str) -> RunConfig:
+    """Resolves a run of `arm`; a random-drop arm's source is settled later.
 
     Raises:
       BadInput: the settings cannot be used; the label is named.
     """
-    given = arm.given(task, arm.seeds)
-    if arm.rates_of is not None:
-        given["drop_rate_from"] = "the source"
     try:
-        return resolve(given)
+        return resolve_run(arm.checked_overrides(task))
     except BadInput as error:
         raise BadInput(f"study, arm {arm.label!r}: {error}") from None
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.config.presets import ARMS
+from sauna.config.presets import arm_settings
 from sauna.config.settings import Config
 from sauna.experiments.curves import common_grid, on_grid
 from sauna.experiments.statistics import (
@@ -263,7 +263,7 @@ def _of_filtering(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
         f"{cell.label} - {other.label}": (cell, other)
         for cell in cells
         for other in cells
-        if ARMS.get(cell.arm, {}).get("filter") == "sauna" and _is_control(other, cell)
+        if _settings(cell.arm).get("filter") == "sauna" and _is_control(other, cell)
     }
     found = compare(
         {
@@ -289,7 +289,7 @@ def _is_control(other: Cell, cell: Cell) -> bool:
         return all(cell.config.get(name) == other.config.get(name) for name in names)
     return all(
         getattr(Config(), name) == value
-        for name, value in ARMS[cell.arm].items()
+        for name, value in _settings(cell.arm).items()
         if name not in FILTERS_OWN
     )
 
@@ -400,7 +400,7 @@ def _missing(cell: Cell) -> dict[str, int]:
 
 
 def _filters(cell: Cell) -> bool:
-    return ARMS.get(cell.arm, {}).get("filter") != "none"
+    return _settings(cell.arm).get("filter") != "none"
 
 
 def _filtering(cell: Cell, name: str) -> str:
@@ -431,3 +431,11 @@ def _about(seeds: int) -> str:
         return f"more than {MANY_SEEDS}"
     unit = 10 ** max(len(str(seeds)) - 2, 0)
     return f"about {math.ceil(seeds / unit) * unit}"
+
+
+def _settings(arm: str) -> dict[str, Any]:
+    """The settings of an arm; none if this version does not know it."""
+    try:
+        return arm_settings(arm)
+    except BadInput:
+        return {}

@@ -26,7 +26,7 @@ class Unit(NamedTuple):
 
     Attributes:
       name: of its folder.
-      settings: what the run is given, without the place and the source of drop rates.
+      settings: of the run, without the place and the source of drop rates.
       source: the unit whose measured drop rates it repeats.
     """
 
@@ -41,12 +41,12 @@ class Unit(NamedTuple):
         """The run directory."""
         return folder / self.name / "run"
 
-    def given(self, folder: Path) -> dict[str, Any]:
-        """Everything that the run is given."""
-        given = {**self.settings, "out": str(self.run(folder)), "processes": 1}
+    def overrides(self, folder: Path) -> dict[str, Any]:
+        """Gives all settings of the run."""
+        overrides = {**self.settings, "out": str(self.run(folder)), "processes": 1}
         if self.source is not None:
-            given["drop_rate_from"] = str(folder / self.source / "run")
-        return given
+            overrides["drop_rate_from"] = str(folder / self.source / "run")
+        return overrides
 
     def error(self, folder: Path) -> str | None:
         """Why it failed for good, or None."""
@@ -93,7 +93,7 @@ def _parts(arm: Arm, size: int) -> Iterator[tuple[int, ...]]:
 
 def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
     source = _unit(arms, arms[arm.rates_of], task, seeds).name if arm.rates_of else None
-    settings = arm.given(task, seeds)
+    settings = arm.overrides(task, seeds)
     digest = digest_of([RULES, identity(arm, task, seeds), source])
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in task)
     name = f"{place}_{arm.arm}_{seeds[0]}-{seeds[-1]}_{digest}"
@@ -102,7 +102,8 @@ def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> 
 
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
     """What of a run's config differs from the defaults: the same for the same training."""
-    config, usual = to_json(check(arm._replace(seeds=seeds), task)), to_json(Config())
+    config = to_json(check(arm._replace(seeds=seeds), task))
+    usual = {**to_json(Config()), "arm": ["sauna"]}  # its default when units got their names
     return {name: value for name, value in config.items() if value != usual[name]}
 
 

@@ -14,15 +14,15 @@ from sauna.training.loop.job import Job, Setting
 from sauna.training.loop.member_state import Counters
 
 
-def goes_on(config: Config, counters: Counters) -> bool:
-    """Whether a whole rollout still fits in the budget: a run never oversteps it."""
+def budget_left(config: Config, counters: Counters) -> bool:
+    """Returns whether a whole rollout still fits in the budget: a run never oversteps it."""
     used = counters.kept_steps if config.budget == "kept" else counters.env_steps
     return config.steps - used >= config.rollout_steps * config.envs
 
 
 def step_limit(config: Config, counters: Counters) -> int:
-    """Env steps that each env of a member may try in the coming rollout; 0: it has finished."""
-    if not goes_on(config, counters):
+    """Counts the env steps that each env may try in the coming rollout; 0: it has finished."""
+    if not budget_left(config, counters):
         return 0
     if config.budget == "kept":
         return capacity(config)
@@ -30,37 +30,42 @@ def step_limit(config: Config, counters: Counters) -> int:
 
 
 def hypers_of(job: Job, p: int, counters: Counters, iteration: int) -> Hypers:
+    """Computes the traced hyperparameters of the job's member `p` in this iteration."""
     rates = job.drop_rates[p] if job.drop_rates else []
     return hypers_now(job.members[p].config, rates, counters, iteration)
 
 
-def hypers_now(own: Config, drop_rates: list[float], counters: Counters, iteration: int) -> Hypers:
-    """A member's traced hyperparameters in this iteration.
+def hypers_now(
+    member_config: Config, drop_rates: list[float], counters: Counters, iteration: int
+) -> Hypers:
+    """Computes a member's traced hyperparameters in this iteration.
 
     Args:
-      own: its config.
+      member_config: its arm's.
       drop_rates: of each iteration; empty: the config's constant one.
     """
-    used = counters.kept_steps if own.budget == "kept" else counters.env_steps
-    left = 1.0 - used / own.steps
-    rate = drop_rates[min(iteration, len(drop_rates) - 1)] if drop_rates else own.drop_rate
-    values = {name: getattr(own, name) for name in Hypers._fields}
+    used = counters.kept_steps if member_config.budget == "kept" else counters.env_steps
+    left = 1.0 - used / member_config.steps
+    rate = member_config.drop_rate
+    if drop_rates:
+        rate = drop_rates[min(iteration, len(drop_rates) - 1)]
+    values = {name: getattr(member_config, name) for name in Hypers._fields}
     values["drop_rate"] = rate
-    values["threshold"] = scheduled(own.threshold, own.threshold_schedule, left)
-    if own.learning_rate_schedule == "linear":
-        values["learning_rate"] = own.learning_rate * left
+    values["threshold"] = scheduled(member_config.threshold, member_config.threshold_schedule, left)
+    if member_config.learning_rate_schedule == "linear":
+        values["learning_rate"] = member_config.learning_rate * left
     return Hypers(**{name: np.float32(value) for name, value in values.items()})  # type: ignore[arg-type]
 
 
 def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
-    """The threshold when the share `left` of the budget is left."""
+    """Schedules the threshold, when the share `left` of the budget is left."""
     return {"constant": threshold, "rising": threshold * (1.0 - left), "falling": threshold * left}[
         schedule
     ]
 
 
 def device_hypers(config: Config, setting: Setting, used: Array, iteration: Array) -> Hypers:
-    """A member's hyperparameters in this iteration: the schedule and the drop rate applied."""
+    """Computes a member's hyperparameters in this iteration, from `setting` and what is `used`."""
     left, rate = 1.0 - used.astype(jnp.float32) / setting.steps, setting.hypers.learning_rate
     rates = setting.drop_rates
     return setting.hypers._replace(

@@ -1,6 +1,6 @@
 """Training the members of one process on the device, several iterations per call.
 
-The loop of `training.py` for environments that are pure functions. What it reports, and when it
+The loop of `host.py` for environments that are pure functions. What it reports, and when it
 may go on, is the same; a call runs as many iterations as are granted and ends where a checkpoint
 is due.
 """
@@ -22,15 +22,15 @@ from sauna.algorithm.rollout.collected import Collected, Episode
 from sauna.algorithm.rollout.device import LARGEST
 from sauna.algorithm.types import Hypers, TrainState, member_keys
 from sauna.config.presets import Member
-from sauna.config.settings import Config, to_json
+from sauna.config.settings import Config, fields_with, to_json
 from sauna.envs.device.contract import flat
 from sauna.envs.device.make import make_jax_env
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.errors import BadInput
 from sauna.system.run_directory import versions
-from sauna.training.loop.budget import goes_on
+from sauna.training.loop.budget import budget_left
 from sauna.training.loop.device_program import (
-    MOST_PER_CALL,
+    MAX_PER_CALL,
     MemberState,
     Population,
     Report,
@@ -44,22 +44,23 @@ from sauna.training.loop.member_state import (
     flat_params,
     named_optimizer,
     named_params,
+    named_sampler,
     under,
     unpack_optimizer,
+    unpack_sampler,
 )
 from sauna.training.loop.metrics import metrics_row
-from sauna.training.loop.multihost import check_shared, join, leave, read_place, same, share, tell
+from sauna.training.loop.multihost import (
+    all_equal,
+    broadcast,
+    broadcast_arrays,
+    check_split,
+    join,
+    leave,
+    read_host_rank,
+)
 
 Arrays = dict[str, np.ndarray]
-# What machines that train together may have each in their own way.
-OF_A_MACHINE = (
-    "distributed",
-    "out",
-    "processes",
-    "keep_checkpoints",
-    "tensorboard",
-    "drop_rate_from",
-)
 
 
 def train_on_device(job: Job, reporter: Reporter) -> None:
@@ -71,9 +72,9 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     """
     reporter.phase("making environments")
     config = job.config
-    place = read_place(config.distributed)
-    join(place)
-    if not same(place, _settings(job)):
+    host = read_host_rank(config.distributed)
+    join(host)
+    if not all_equal(host, _settings(job)):
         leave()
         raise BadInput(
             "distributed: the machines have different settings or versions; give each "
@@ -83,31 +84,32 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     if config.device == "gpu":
         reporter.phase(f"on {population.devices} of {len(jax.devices())} GPUs")
     counters = [Counters() for _ in job.members]
-    restored = share(place, dict(job.restored or {}))
+    restored = broadcast_arrays(host, dict(job.restored or {}))
     if restored:
         counters = _restore(job, population, restored)
     reporter.phase("compiling")
     reporter.phase(f"compiled in {population.compile():.1f} s")
-    iteration = tell(place, job.start)
-    while any(goes_on(config, c) for c in counters):
+    iteration = broadcast(host, job.start)
+    while any(budget_left(config, c) for c in counters):
         due = config.checkpoint_every - iteration % config.checkpoint_every
-        number = tell(place, min(reporter.allowance(iteration), due, MOST_PER_CALL))
+        number = broadcast(host, min(reporter.allowance(iteration), due, MAX_PER_CALL))
         if not number:
             break
         clock = time.perf_counter()
         reports = population.run(iteration, number)
         seconds = time.perf_counter() - clock
-        iteration = _tell(job, reporter, iteration, reports, counters, seconds)
+        iteration = _report(job, reporter, iteration, reports, counters, seconds)
         if iteration % config.checkpoint_every == 0:
             reporter.state(iteration, pack(job, population, counters))
     reporter.state(iteration, pack(job, population, counters))
 
 
 def _settings(job: Job) -> str:
-    """What must be alike on machines that train together."""
-    own = dict.fromkeys(OF_A_MACHINE, "")
-    members = [{**to_json(member.config), **own} for member in job.members]
-    return json.dumps([{**to_json(job.config), **own}, members, job.drop_rates, versions()])
+    """Writes what must be alike on machines that train together."""
+    blank = dict.fromkeys(fields_with("machine_local"), "")
+    members = [{**to_json(member.config), **blank} for member in job.members]
+    rates = list(job.drop_rates)
+    return json.dumps([{**to_json(job.config), **blank}, members, rates, versions()])
 
 
 def make_population(job: Job) -> Population:
@@ -124,12 +126,12 @@ def make_population(job: Job) -> Population:
     devices = _devices(config)
     mesh = make_mesh(len(settings), config.envs, devices)
     if config.distributed:
-        check_shared("distributed", len(settings), config.envs, len(devices))
+        check_split("distributed", len(settings), config.envs, len(devices))
     return Population(config, job.spaces, env, settings, mesh)
 
 
 def _devices(config: Config) -> list[Any]:
-    """Those that share the population: of all machines.
+    """Lists the devices that share the population, of all machines.
 
     Raises:
       BadInput: there are fewer than asked for, or of another kind.
@@ -150,7 +152,7 @@ def _setting(member: Member, drop_rates: list[float], length: int) -> Setting:
     return Setting(member_keys(member.seed), hypers, jnp.asarray(rates, jnp.float32), steps)
 
 
-def _tell(
+def _report(
     job: Job,
     reporter: Reporter,
     first: int,
@@ -159,7 +161,7 @@ def _tell(
     seconds: float,
 ) -> int:
     """Reports what one call ran; the iteration that comes next."""
-    ran = np.stack([report.ran for report in reports])  # [P, MOST_PER_CALL]
+    ran = np.stack([report.ran for report in reports])  # [P, MAX_PER_CALL]
     number = int(ran.any(0).sum())
     for i in range(number):
         rows, steps = [], 0
@@ -230,7 +232,7 @@ def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
 def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arrays:
     learner = state.learner
     arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
-    arrays |= named_optimizer(learner)
+    arrays |= named_optimizer(learner) | named_sampler(learner)
     arrays |= counters.to_arrays()
     moments = state.collect.observation_moments
     if isinstance(moments, LongMoments):  # where a trained policy looks for them, as the host's
@@ -285,7 +287,7 @@ def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray])
         params = flat_params(population.policy, example.learner.params, under("params/", own))
         states.append(
             MemberState(
-                TrainState(params, optimizer),
+                TrainState(params, optimizer, unpack_sampler(own, example.learner)),
                 filled(example.collect, under("collect/", own)),
                 jnp.int32(counted.env_steps),
                 jnp.int32(counted.kept_steps),

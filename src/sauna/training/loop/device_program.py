@@ -17,23 +17,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.learner.program import make_parts
 from sauna.algorithm.learner.samples import make_batch
-from sauna.algorithm.learner.update import device_minibatch_order, init_state, learn
-from sauna.algorithm.learner.vex_targets import VexTarget, make_target
+from sauna.algorithm.learner.update import Parts, device_minibatch_order, init_state
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.device import Collecting, CollectState, Ends, Faults, collect, start
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.types import Array, Hypers, Rollout, TrainState
+from sauna.algorithm.types import Array, Hypers, Rollout, TrainState, selection_key
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv
 from sauna.envs.spaces import Spaces
 from sauna.training.loop.budget import device_hypers
 from sauna.training.loop.job import Setting
-from sauna.training.loop.multihost import shared_over
+from sauna.training.loop.multihost import split_over_devices
 
-MOST_PER_CALL = 32  # iterations; their reports wait in the device's memory for the call's end
+MAX_PER_CALL = 32  # iterations; their reports wait in the device's memory for the call's end
 MEMBERS, ENVS = "members", "envs"  # axes of the mesh
 
 
@@ -58,33 +59,35 @@ class Report(NamedTuple):
     learning_rate: Array
 
 
-class Parts(NamedTuple):
+class IterationParts(NamedTuple):
     """The static parts of an iteration."""
 
     config: Config
     collecting: Collecting
     policy: Policy
-    target: VexTarget
+    learning: Parts
 
 
-def make_parts(config: Config, spaces: Spaces, env: JaxEnv, anywhere: Any) -> Parts:
-    """Args:
-    env: flat, of `spaces`.
-    anywhere: see `jax_env.advance`.
+def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, anywhere: Any) -> IterationParts:
+    """Builds the static parts of an iteration.
+
+    Args:
+      env: flat, of `spaces`.
+      anywhere: see `jax_env.advance`.
     """
     policy = make_policy(config, spaces)
     collecting = Collecting(config, env, policy, make_filter(config), anywhere)
-    return Parts(config, collecting, policy, make_target(config))
+    return IterationParts(config, collecting, policy, make_parts(config, policy, spaces))
 
 
-def init_member(parts: Parts, setting: Setting) -> MemberState:
+def init_member(parts: IterationParts, setting: Setting) -> MemberState:
     zero = jnp.int32(0)
-    learner = init_state(parts.config, parts.policy, setting.keys.init)
+    learner = init_state(parts.learning, setting.keys.init)
     return MemberState(learner, start(parts.collecting, setting.keys.env), zero, zero)
 
 
 def iterate(
-    parts: Parts, state: MemberState, setting: Setting, iteration: Array
+    parts: IterationParts, state: MemberState, setting: Setting, iteration: Array
 ) -> tuple[MemberState, Report]:
     """One iteration of one member: collect -> advantages -> update.
 
@@ -92,11 +95,11 @@ def iterate(
     """
     config = parts.config
     used = state.kept_steps if config.budget == "kept" else state.env_steps
-    goes_on = setting.steps - used >= config.rollout_steps * config.envs
+    has_budget = setting.steps - used >= config.rollout_steps * config.envs
     limit = jnp.int32(capacity(config))
     if config.budget == "env":
         limit = jnp.minimum(limit, (setting.steps - used) // config.envs)
-    limit = jnp.where(goes_on, limit, 0)
+    limit = jnp.where(has_budget, limit, 0)
     hypers = device_hypers(config, setting, used, iteration)
     collected, rollout, ends, faults = collect(
         parts.collecting,
@@ -113,13 +116,13 @@ def iterate(
     after = MemberState(
         learner, collected, state.env_steps + env_steps, state.kept_steps + kept_steps
     )
-    after = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), after, state)
-    report = Report(goes_on, env_steps, kept_steps, ends, faults, learned, hypers.learning_rate)
+    after = jax.tree.map(lambda new, old: jnp.where(has_budget, new, old), after, state)
+    report = Report(has_budget, env_steps, kept_steps, ends, faults, learned, hypers.learning_rate)
     return after, report
 
 
 def learn_from(
-    parts: Parts,
+    parts: IterationParts,
     learner: TrainState,
     rollout: Rollout,
     setting: Setting,
@@ -128,18 +131,10 @@ def learn_from(
 ) -> tuple[TrainState, UpdateMetrics]:
     """Advantages and the update."""
     config = parts.config
-    batch = make_batch(rollout, hypers, config=config, target=parts.target)
+    key = selection_key(setting.keys, iteration)
+    batch = make_batch(rollout, hypers, key, config=config, target=parts.learning.target)
     order = device_minibatch_order(config, jax.random.fold_in(setting.keys.order, iteration))
-    return learn(
-        learner,
-        rollout,
-        batch,
-        hypers,
-        order,
-        config=config,
-        policy=parts.policy,
-        target=parts.target,
-    )
+    return learn(learner, rollout, batch, hypers, order, key, parts=parts.learning)
 
 
 def several(
@@ -149,21 +144,21 @@ def several(
     first: Array,
     number: Array,
 ) -> tuple[Any, Report]:
-    """Iterations `first` to `first + number`, at most `MOST_PER_CALL`.
+    """Iterations `first` to `first + number`, at most `MAX_PER_CALL`.
 
     How many is traced: one program serves every number, so results do not depend on it. It ends
     early once some number is not finite, with that iteration's report as the last that ran, or
     when no member's budget holds a further rollout.
 
     Returns:
-      the state, and reports with a leading axis `[MOST_PER_CALL]`, `ran` False where none is.
+      the state, and reports with a leading axis `[MAX_PER_CALL]`, `ran` False where none is.
     """
     shapes = jax.eval_shape(iterate, state, setting, first)[1]
-    empty = jax.tree.map(lambda x: jnp.zeros((MOST_PER_CALL, *x.shape), x.dtype), shapes)
+    empty = jax.tree.map(lambda x: jnp.zeros((MAX_PER_CALL, *x.shape), x.dtype), shapes)
 
-    number = jnp.minimum(number, MOST_PER_CALL)
+    number = jnp.minimum(number, MAX_PER_CALL)
 
-    def goes_on(now: tuple[Array, Any, Report, Array]) -> Array:
+    def not_last(now: tuple[Array, Any, Report, Array]) -> Array:
         return (now[0] < number) & now[3]
 
     def step(now: tuple[Array, Any, Report, Array]) -> tuple[Array, Any, Report, Array]:
@@ -173,7 +168,7 @@ def several(
         return i + 1, state, reports, jnp.all(is_sound(report)) & jnp.any(report.ran)
 
     _, state, reports, _ = jax.lax.while_loop(
-        goes_on, step, (jnp.int32(0), state, empty, jnp.bool_(True))
+        not_last, step, (jnp.int32(0), state, empty, jnp.bool_(True))
     )
     return state, reports
 
@@ -210,7 +205,7 @@ class Population:
             """Over the members of one program: stays a scalar, so that a branch stays a branch."""
             return jax.lax.pmax(here.astype(jnp.int32), MEMBERS) > 0 if together else here
 
-        self.parts = parts = make_parts(config, spaces, env, anywhere)
+        self.parts = parts = make_iteration(config, spaces, env, anywhere)
         self.policy = parts.policy
         init = self.over_members(partial(init_member, parts))
         self._settings: Any = stack(settings) if together else settings
@@ -257,7 +252,7 @@ class Population:
         return time.perf_counter() - clock
 
     def run(self, first: int, number: int) -> list[Report]:
-        """Runs up to `number` iterations; the reports (numpy) of each member `[MOST_PER_CALL]`."""
+        """Runs up to `number` iterations; the reports (numpy) of each member `[MAX_PER_CALL]`."""
         span = np.int32(first), np.int32(number)
         if not self._one_by_one:
             self._state, reports = self._run(self._state, self._settings, *span)
@@ -296,7 +291,7 @@ def make_mesh(members: int, envs: int, devices: list[Any]) -> Mesh | None:
     None with one device. Devices that neither members nor environments can be shared over evenly
     are left out.
     """
-    over_members, over_envs = shared_over(members, envs, len(devices))
+    over_members, over_envs = split_over_devices(members, envs, len(devices))
     used = over_members * over_envs
     if used == 1:
         return None

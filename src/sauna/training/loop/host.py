@@ -8,6 +8,7 @@ This is the loop itself. Who starts it, what is shown of it and where its messag
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,12 +19,12 @@ from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.rollout.collected import Collected
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
-from sauna.algorithm.types import Hypers, Keys, TrainState, member_keys
+from sauna.algorithm.types import Hypers, Keys, TrainState, member_keys, selection_key
 from sauna.config.presets import Member
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
-from sauna.training.loop.budget import goes_on, hypers_of, step_limit
+from sauna.training.loop.budget import budget_left, hypers_of, step_limit
 from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
 from sauna.training.loop.member_state import Counters, pack_member, unpack_member
 from sauna.training.loop.metrics import metrics_row
@@ -39,25 +40,31 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
     config, members = job.config, job.members
     reporter.phase("making environments")
     program = make_program(config, job.spaces)
-    learner = make_learner(config, program.policy)
+    learner = make_learner(config, program.policy, job.spaces)
     keys = [member_keys(member.seed) for member in members]
+    draw_key = jax.jit(selection_key)
     envs = make_envs(job)
     try:
         collector = HostCollector(program, job.spaces, envs, keys)
         states, counters = _start(job, program, learner, keys, collector, envs)
         reporter.phase("compiling")
         iteration = job.start
-        while any(goes_on(config, c) for c in counters) and reporter.allowance(iteration):
-            clock = time.perf_counter()
+        while any(budget_left(config, c) for c in counters) and reporter.allowance(iteration):
+            clock, cpu = time.perf_counter(), time.process_time()
             hypers = [hypers_of(job, p, counters[p], iteration) for p in range(len(members))]
             limit = np.array([step_limit(config, c) for c in counters])
             params = np.stack([np.asarray(state.params) for state in states])
             collected = collector.collect(params, hypers, iteration, limit)
             collect_seconds = time.perf_counter() - clock
-            rows = []
+            collect_cpu = time.process_time() - cpu
+            rows, update_cpu = [], {}
             for p in np.flatnonzero(limit):
+                cpu = time.process_time()
                 order = minibatch_order(config, members[p].seed, iteration)
-                states[p], learned = _learn(learner, states[p], collected[p], hypers[p], order)
+                states[p], learned = _learn(
+                    learner, states[p], collected[p], hypers[p], order, draw_key(keys[p], iteration)
+                )
+                update_cpu[members[p].name] = time.process_time() - cpu
                 check_finite(members[p], iteration, learned)
                 counters[p].add(collected[p])
                 rows.append(
@@ -71,10 +78,12 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
                         hypers[p],
                     )
                 )
-            timing = {
+            timing: dict[str, Any] = {
                 "env_steps": sum(collected[p].env_steps for p in np.flatnonzero(limit)),
                 "seconds": time.perf_counter() - clock,
                 "collect_seconds": collect_seconds,
+                "collect_cpu_seconds": collect_cpu,
+                "update_cpu_seconds": update_cpu,
             }
             reporter.iteration(iteration, rows, timing)
             iteration += 1
@@ -124,10 +133,11 @@ def _learn(
     collected: Collected,
     hypers: Hypers,
     order: np.ndarray,
+    key: Any,
 ) -> tuple[TrainState, UpdateMetrics]:
     assert collected.rollout is not None
-    batch = learner.make_batch(collected.rollout, hypers)
-    state, metrics = learner.learn(state, collected.rollout, batch, hypers, order)
+    batch = learner.make_batch(collected.rollout, hypers, key)
+    state, metrics = learner.learn(state, collected.rollout, batch, hypers, order, key)
     return state, jax.device_get(metrics)
 
 

@@ -1,8 +1,8 @@
-"""What one process trains, and who hears of it."""
+"""What one process trains, and where it reports."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -24,41 +24,44 @@ class NonFinite(SaunaError):
 class Reporter(Protocol):
     """Where the loop's messages go, and where its permissions come from."""
 
-    def phase(self, text: str) -> None: ...
+    def phase(self, text: str) -> None:
+        """Reports what is done now."""
 
     def allowance(self, iteration: int) -> int:
-        """Waits until iteration `iteration` may start; how many may from there on. 0: stop."""
+        """Waits until `iteration` may start; returns how many may from there on. 0: stop."""
 
-    def iteration(
-        self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, float]
-    ) -> None: ...
+    def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
+        """Reports a finished iteration."""
 
-    def state(self, iteration: int, arrays: Arrays) -> None: ...
+    def state(self, iteration: int, arrays: Arrays) -> None:
+        """Reports the state of all members at the start of an iteration."""
 
 
 class Job(NamedTuple):
-    """What one process trains."""
+    """What one process trains; `Prepared.job` makes it."""
 
     config: Config
     spaces: Spaces
     env_kwargs: dict[str, Any]
     members: list[Member]
-    drop_rates: list[list[float]]  # per member and iteration; empty: the config's constant rate
-    restored: Mapping[str, np.ndarray] | None  # a checkpoint's arrays, or None to start afresh
-    start: int  # the first iteration to run
-    replay: bool  # whether environments can be brought back by replaying
+    drop_rates: Sequence[list[float]] = ()  # per member and iteration; empty: the constant rate
+    restored: Mapping[str, np.ndarray] | None = None  # a checkpoint's arrays; None: start afresh
+    start: int = 0  # the first iteration to run
+    replay: bool = True  # whether environments can be brought back by replaying
 
 
 def check_finite(member: Member, iteration: int, metrics: UpdateMetrics) -> None:
-    """Raises:
-    NonFinite: naming the member and the iteration.
+    """Refuses an update that gave a number which is not finite.
+
+    Raises:
+      NonFinite: naming the member and the iteration.
     """
     if not metrics.finite:
         raise NonFinite(f"{member.name}: the update of iteration {iteration} is not finite")
 
 
 class Setting(NamedTuple):
-    """What a member is given and does not change."""
+    """What stays constant for a member on the device."""
 
     keys: Keys
     hypers: Hypers  # with the learning rate before its schedule

@@ -119,7 +119,7 @@ def pack_member(
 ) -> dict[str, np.ndarray]:
     """Member `p`'s state, every name starting with the member's."""
     arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
-    arrays |= named_optimizer(state)
+    arrays |= named_optimizer(state) | named_sampler(state)
     arrays |= counters.to_arrays()
     for key, value in (moments_of(collector, p) | collected_of(collector, p)).items():
         arrays[key] = value
@@ -142,6 +142,24 @@ def named_optimizer(state: TrainState) -> dict[str, np.ndarray]:
             "adam/variance": optimizer.nu,
         }
     return {name: np.asarray(array) for name, array in named.items()}
+
+
+def named_sampler(state: TrainState) -> dict[str, np.ndarray]:
+    """What a selection rule carries from one iteration to the next, in its own order."""
+    leaves = jax.tree_util.tree_leaves(state.sampler)
+    return {f"sampler/{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+
+
+def unpack_sampler(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
+    """The inverse of `named_sampler`.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    structure = jax.tree_util.tree_structure(example.sampler)
+    named = named_sampler(example)
+    leaves = [jnp.asarray(fitting(own, name, place)) for name, place in named.items()]
+    return jax.tree_util.tree_unflatten(structure, leaves)
 
 
 def unpack_optimizer(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
@@ -177,7 +195,7 @@ def unpack_member(
     """
     own = under(name + "/", arrays)
     params = flat_params(policy, example.params, under("params/", own))
-    state = TrainState(params, unpack_optimizer(own, example))
+    state = TrainState(params, unpack_optimizer(own, example), unpack_sampler(own, example))
     counters = Counters.from_arrays(own)
     for key, place in moments_of(collector, p).items():
         place[...] = fitting(own, key, place)

@@ -49,8 +49,9 @@ def metrics_row(
     if config.gae_over == "kept" and counters.reported_returns:
         # The released code logs only episodes whose last step was kept.
         row["return_mean_reported"] = float(np.mean(counters.reported_returns))
-    for name, value in learned._asdict().items():
-        if name != "finite" and math.isfinite(value):
+    scalars = learned._asdict() | learned.work._asdict()
+    for name, value in scalars.items():
+        if name not in ("finite", "work") and math.isfinite(value):
             row[name] = float(value)
     if "vex_target" in row and not float(hypers.vex_coef):
         del row["vex_loss"], row["vex_target"]  # nothing learns them in this arm

@@ -1,7 +1,7 @@
 """Several machines that train together, joined by `jax.distributed`.
 
 Every machine runs the same command, but for its index, and computes its part of the same program.
-Machine 0 alone writes the run and decides how far it goes; the others are told, call by call.
+Machine 0 alone writes the run and decides how far it goes; it broadcasts that, call by call.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ import numpy as np
 from sauna.system.errors import BadInput
 
 
-class Place(NamedTuple):
-    """Where this machine stands among the others."""
+class HostRank(NamedTuple):
+    """This machine's rank among those that train together."""
 
-    address: str  # HOST:PORT of machine 0
-    machines: int
-    number: int  # of this one, from 0
-
-
-ALONE = Place("", 1, 0)
+    address: str  # HOST:PORT of rank 0
+    hosts: int
+    rank: int  # of this one, from 0
 
 
-def read_place(text: str) -> Place:
-    """`HOST:PORT,COUNT,INDEX`; the empty text is one machine alone.
+SINGLE_HOST = HostRank("", 1, 0)
+
+
+def read_host_rank(text: str) -> HostRank:
+    """Reads `HOST:PORT,COUNT,INDEX`; the empty text is one machine alone.
 
     Raises:
       BadInput: it is not of that form.
     """
     if not text:
-        return ALONE
+        return SINGLE_HOST
     address, *numbers = text.split(",")
     if len(numbers) != 2 or not all(n.isdecimal() for n in numbers) or ":" not in address:
         raise BadInput(f"distributed: {text!r} is not HOST:PORT,COUNT,INDEX")
@@ -42,62 +42,62 @@ def read_place(text: str) -> Place:
             f"distributed: index {index} of {count} machines; it counts from 0, and "
             f"takes at least 2"
         )
-    return Place(address, count, index)
+    return HostRank(address, count, index)
 
 
-def join(place: Place) -> None:
+def join(host: HostRank) -> None:
     """Waits until all machines are there, once. Before anything else is asked of JAX."""
-    if place.machines > 1:
+    if host.hosts > 1:
         import jax
 
         if jax.distributed.is_initialized():
             return
-        jax.distributed.initialize(place.address, place.machines, place.number)
+        jax.distributed.initialize(host.address, host.hosts, host.rank)
 
 
 def leave() -> None:
-    """Waits until all machines leave: where one merely ends, JAX aborts the others."""
+    """Waits until all machines leave: if one merely ends, JAX aborts the others."""
     import jax
 
     jax.distributed.shutdown()
 
 
-def tell(place: Place, number: int) -> int:
-    """What machine 0 says, on every machine."""
-    if place.machines == 1:
+def broadcast(host: HostRank, number: int) -> int:
+    """Gives rank 0's number to every machine."""
+    if host.hosts == 1:
         return number
     from jax.experimental.multihost_utils import broadcast_one_to_all
 
     return int(broadcast_one_to_all(np.int32(number)))
 
 
-def same(place: Place, text: str) -> bool:
-    """Whether all machines say the same."""
-    if place.machines == 1:
+def all_equal(host: HostRank, text: str) -> bool:
+    """Returns whether all machines have the same text."""
+    if host.hosts == 1:
         return True
     from jax.experimental.multihost_utils import process_allgather
 
-    own = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
-    return bool((np.asarray(process_allgather(own)) == own).all())
+    digest = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
+    return bool((np.asarray(process_allgather(digest)) == digest).all())
 
 
-def share(place: Place, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Machine 0's arrays, on every machine."""
-    if place.machines == 1:
+def broadcast_arrays(host: HostRank, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Gives rank 0's arrays to every machine."""
+    if host.hosts == 1:
         return arrays
     from jax.experimental.multihost_utils import broadcast_one_to_all
     from safetensors.numpy import load, save
 
     blob = np.frombuffer(save(arrays), np.uint8)
-    size = tell(place, len(blob))
-    room = blob if place.number == 0 else np.zeros(size, np.uint8)
-    return load(np.asarray(broadcast_one_to_all(room)).tobytes())
+    size = broadcast(host, len(blob))
+    buffer = blob if host.rank == 0 else np.zeros(size, np.uint8)
+    return load(np.asarray(broadcast_one_to_all(buffer)).tobytes())
 
 
-def shared_over(members: int, envs: int, devices: int) -> tuple[int, int]:
-    """Over how many devices members are shared, and the environments of each: as many as divide.
+def split_over_devices(members: int, envs: int, devices: int) -> tuple[int, int]:
+    """Finds over how many devices members are split, and the environments of each member.
 
-    Where several ways use as many devices, members go first.
+    As many as divide evenly; if several ways use as many devices, members go first.
     """
     return max(
         (
@@ -110,13 +110,13 @@ def shared_over(members: int, envs: int, devices: int) -> tuple[int, int]:
     )
 
 
-def check_shared(name: str, members: int, envs: int, devices: int) -> None:
+def check_split(name: str, members: int, envs: int, devices: int) -> None:
     """Refuses devices of which some would be idle.
 
     Raises:
       BadInput: the field `name` asked for them.
     """
-    over_members, over_envs = shared_over(members, envs, devices)
+    over_members, over_envs = split_over_devices(members, envs, devices)
     if over_members * over_envs < devices:
         raise BadInput(
             f"{name}: {members} members of {envs} environments cannot be shared evenly "

@@ -24,7 +24,7 @@ class LocalExecutor(Executor):
         place, name = self._folder / unit.name, unit.name
         place.mkdir(parents=True, exist_ok=True)
         self._processes[name] = UnitProcess(
-            unit.given(self._folder),
+            unit.overrides(self._folder),
             place / "stderr.txt",
             lambda message: self._messages.put((name, message)),
         )

@@ -19,7 +19,7 @@ class UnitProcess:
     """A unit's process (`unit_process.py`), or another module that speaks the same protocol.
 
     Args:
-      given: what the unit is given.
+      overrides: the settings of the unit.
       log: what it prints besides its messages is appended there.
       tell: is called, in a thread of its own, with each message, and with None at the end.
       environment: of the process; by default ours.
@@ -28,7 +28,7 @@ class UnitProcess:
 
     def __init__(
         self,
-        given: Mapping[str, Any],
+        overrides: Mapping[str, Any],
         log: Path,
         tell: Callable[[Message | None], None],
         environment: Mapping[str, str] | None = None,
@@ -46,7 +46,7 @@ class UnitProcess:
             )
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(json.dumps(given) + "\n")
+            self._process.stdin.write(json.dumps(overrides) + "\n")
             self._process.stdin.flush()
         except BrokenPipeError:
             pass  # its end is noticed when its output ends

@@ -164,9 +164,9 @@ class RayExecutor(Executor):
         ):  # by a local unit of a study that was killed: about to save and end
             self._waiting.append(self._running.pop(unit.name))
             return
-        given = unit.given(self._folder)
-        task = self._task.options(num_gpus=1) if given.get("device") == "gpu" else self._task
-        self._tasks[task.remote(self._hub, unit.name, given, self._git)] = unit.name
+        overrides = unit.overrides(self._folder)
+        task = self._task.options(num_gpus=1) if overrides.get("device") == "gpu" else self._task
+        self._tasks[task.remote(self._hub, unit.name, overrides, self._git)] = unit.name
 
     def _pump(self) -> None:
         if not self._tasks:

@@ -87,13 +87,13 @@ class Hub:
         self._stopping = True
 
 
-def run_unit(hub: Any, name: str, given: dict[str, Any], git: str | None) -> str:
+def run_unit(hub: Any, name: str, overrides: dict[str, Any], git: str | None) -> str:
     """Trains or continues a unit.
 
     Args:
       hub: the actor.
       name: of the unit.
-      given: what its run is given on the study's machine.
+      overrides: the settings of its run on the study's machine.
       git: the study's revision.
 
     Returns:
@@ -107,18 +107,18 @@ def run_unit(hub: Any, name: str, given: dict[str, Any], git: str | None) -> str
     with tempfile.TemporaryDirectory(prefix="sauna-", ignore_cleanup_errors=True) as folder:
         place = Path(folder)
         write(place, files)
-        recorded = {key: given[key] for key in ("out", "drop_rate_from") if key in given}
+        recorded = {key: overrides[key] for key in ("out", "drop_rate_from") if key in overrides}
         here = {"out": str(place / "run"), "drop_rate_from": str(place / "source")}
-        unit = given | {key: here[key] for key in recorded}
+        unit = overrides | {key: here[key] for key in recorded}
         unit["elsewhere"] = {"recorded": {**recorded, "git": git}, "folder": folder}
         return _train(place, unit, lambda *said: ray.get(hub.say.remote(name, attempt, *said)))
 
 
-def _train(place: Path, given: dict[str, Any], say: Callable[..., bool]) -> str:
+def _train(place: Path, overrides: dict[str, Any], say: Callable[..., bool]) -> str:
     """Runs the unit's process to its end; `say(messages, changes)` answers whether to stop."""
     tracker, newest = Tracker(place), checkpoints(place)[-1:]
     heard: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
-    process = UnitProcess(given, place / "stderr.txt", heard.put, _environment())
+    process = UnitProcess(overrides, place / "stderr.txt", heard.put, _environment())
     error: str | None = None
     how: str | None = None
     try:

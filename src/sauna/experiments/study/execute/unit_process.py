@@ -12,7 +12,6 @@ what its config has to name instead, and `folder`, which only we can remove if o
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import shutil
@@ -25,7 +24,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from sauna.config.presets import Member
-from sauna.config.settings import Config, to_json
+from sauna.config.settings import Config
+from sauna.config.stored import to_stored
 from sauna.config.trust import covers
 from sauna.system import run_directory
 from sauna.system.errors import Interrupted, SaunaError
@@ -78,17 +78,17 @@ def _shown(row: dict[str, Any]) -> dict[str, Any]:
     return {key: row[key] for key in SHOWN if key in row}
 
 
-def train(given: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay) -> None:
+def train(overrides: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay) -> None:
     """Starts the run, or continues it where it is."""
-    path, deadline = Path(given["out"]), time.monotonic() + PATIENCE
+    path, deadline = Path(overrides["out"]), time.monotonic() + PATIENCE
     while True:
         resume = (path / "config.json").exists()
         try:
             if resume:  # also where it was begun on another machine, for this study
-                trust = covers(given, run_directory.read_config(path))
+                trust = covers(overrides, run_directory.read_config(path))
                 run = runs.reopen(path, {}, display, trust)
             else:
-                run = runs.start(given, display)
+                run = runs.start(overrides, display)
             break
         except (
             run_directory.InUse
@@ -105,23 +105,20 @@ def _record(run: runs.Run, recorded: dict[str, Any]) -> None:
     """Notes places and revision as on the study's machine, where the run is kept."""
     stored = run_directory.read_config(run.path)
     stored["git"] = recorded.pop("git")
-    run.config = dataclasses.replace(run.config, **recorded)
-    run.given = {**run.given, **recorded}
-    run_directory.write_json(
-        run.path / "config.json", {**stored, "config": to_json(run.config), "given": run.given}
-    )
+    run.prepared = run.prepared._replace(run=run.prepared.run.replace(**recorded))
+    run_directory.write_json(run.path / "config.json", {**stored, **to_stored(run.prepared.run)})
 
 
 def main() -> int:
     parent = os.getppid()
-    given = json.loads(sys.stdin.readline())
-    elsewhere = given.pop("elsewhere", {})
+    overrides = json.loads(sys.stdin.readline())
+    elsewhere = overrides.pop("elsewhere", {})
     threading.Thread(target=_stop_with_the_study, daemon=True).start()
     # What an environment or a library prints must not mix with our lines: it goes to the log.
     display = LineDisplay(os.fdopen(os.dup(1), "w"))
     os.dup2(2, 1)
     try:
-        train(given, elsewhere, display)
+        train(overrides, elsewhere, display)
     except Interrupted as error:
         return 128 + error.signal_number
     except SaunaError as error:

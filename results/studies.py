@@ -1,0 +1,93 @@
+"""The studies whose results are in the repository, and how their pages are put together."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from sauna.experiments.measure import coverage_report, noise_report, posture_report
+
+ROOT = Path(__file__).parent.parent
+STUDIES = ("fig3", "cheetah30", "release", "a2c", "minatar", "pong")
+CLAIMED = {  # the studies that the claims are judged by, and how the summary calls their tasks
+    "fig3": "MuJoCo tasks",
+    "cheetah30": "HalfCheetah with 30 seeds",
+    "release": "tasks with the authors' settings",
+    "minatar": "MinAtar games",
+}
+MEASURED = {"noise": noise_report, "dial": coverage_report, "fig5": posture_report}
+FILES = {"dial": "threshold_sweep", "fig5": "posture"}  # a page's name where it is not the study's
+DECIDED = ("better", "worse")
+
+TITLES = {
+    "fig3": "Six MuJoCo tasks, every arm",
+    "cheetah30": "HalfCheetah with 30 seeds",
+    "release": "The authors' training settings",
+    "a2c": "A2C instead of PPO",
+    "minatar": "Four MinAtar games",
+    "pong": "Pong, one seed",
+    "noise": "Are the dropped steps noisier?",
+    "dial": "Threshold sweep: exploration against return",
+    "fig5": "HalfCheetah: on its feet or on its back",
+}
+WHY = {
+    "fig3": "The paper's Table 1 and its Figures 2 and 3, with two controls that the paper lacks: "
+    "the head without the filter, and a matched random control.",
+    "cheetah30": "The returns of HalfCheetah have two modes. Six seeds cannot tell them apart.",
+    "release": "The authors' run script uses 15 epochs and a constant learning rate.",
+    "a2c": "Does the effect of the filter depend on the algorithm?",
+    "minatar": "The paper has no MinAtar games. At threshold 0.3 the filter drops a few percent "
+    "here, so this study uses 0.8.",
+    "pong": "One seed is no comparison. It shows how far a million env steps go on Atari.",
+    "noise": "The paper says that the dropped samples are noisy. The policy gradient of dropped "
+    "steps was measured at five checkpoints of each seed.",
+    "dial": "The paper says that the threshold trades exploration for exploitation. Thresholds "
+    "from 0 to 1.5 were trained, and two random controls.",
+    "fig5": "The paper says that PPO often slides on its back, and SAUNA does not (section 4.4).",
+}
+# How a label of a result file is shown.
+LABELS = {
+    "coin like 0.8": "random control of 0.8",
+    "coin like 1": "random control of 1",
+    "keeps 3 in 4": "keep rate 0.75",
+    "keeps 1 in 2": "keep rate 0.5",
+}
+
+
+@functools.cache
+def load(name: str) -> dict[str, Any] | None:
+    """`results/NAME.json`, which nobody changes in memory; None if there is none."""
+    path = ROOT / "results" / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def page_of(name: str) -> str:
+    return f"{FILES.get(name, name)}.md"
+
+
+def shown_label(label: str) -> str:
+    return LABELS.get(label, label)
+
+
+def listed(sentences: Iterable[str]) -> str:
+    return "\n".join(f"- {text}" for text in sentences)
+
+
+def markdown(rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
+
+
+def folded(title: str, text: str) -> str:
+    """`text` behind a line to click on; GitHub and the site both show it."""
+    return f'<details markdown="1"><summary>{title}</summary>\n\n{text}\n\n</details>'
+
+
+def page(template: str, **parts: str) -> str:
+    """`templates/TEMPLATE.md` with its `{parts}` filled in; an empty part leaves no gap."""
+    text = (Path(__file__).parent / "templates" / f"{template}.md").read_text().format(**parts)
+    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"

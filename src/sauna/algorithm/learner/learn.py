@@ -1,0 +1,119 @@
+"""Everything that one iteration learns from a rollout, and what is logged of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sauna.algorithm.learner.losses import Losses, standardize, weighted_mean
+from sauna.algorithm.learner.metrics import (
+    UpdateMetrics,
+    Work,
+    head_statistics,
+    variance_explained,
+)
+from sauna.algorithm.learner.selected import (
+    Totals,
+    drawn_length,
+    needs_selection,
+    update_on_selected,
+)
+from sauna.algorithm.learner.update import Parts, update_on_all, vex_targets
+from sauna.algorithm.selection.draws import minibatch_size
+from sauna.algorithm.selection.vex_filter import moved_threshold
+from sauna.algorithm.types import Array, Batch, Hypers, Rollout, TrainState
+
+
+def learn(
+    state: TrainState,
+    rollout: Rollout,
+    batch: Batch,
+    hypers: Hypers,
+    order: Array,
+    key: Array,
+    *,
+    parts: Parts,
+) -> tuple[TrainState, UpdateMetrics]:
+    """The update and everything that is logged about it.
+
+    Args:
+      batch: what `samples.make_batch` made of the rollout.
+      order: `[epochs, M]` int32, a permutation of the samples for each epoch.
+      key: of the draws of this iteration's selection; not read without one.
+    """
+    config = parts.config
+    mean_target = weighted_mean(vex_targets(batch, parts.target), batch.weight)
+    if needs_selection(parts):
+        state, totals = update_on_selected(state, batch, rollout, hypers, order, key, parts=parts)
+        losses, gradient_norm, work = _means(totals, batch, rollout, parts)
+        sound = jnp.isfinite(totals.losses.total)
+    else:
+        learned_from = batch
+        if config.normalize_advantages and config.normalize_over != "minibatch":
+            standardized = standardize(batch.advantage, batch.weight)
+            learned_from = batch._replace(advantage=standardized)
+        state, losses, gradient_norm = update_on_all(
+            state, learned_from, hypers, order, parts=parts
+        )
+        work = _all_work(batch, losses, parts)
+        sound = jnp.isfinite(losses.total)
+    metrics = UpdateMetrics(
+        losses.policy_loss,
+        losses.value_loss,
+        losses.vex_loss,
+        losses.entropy,
+        losses.kl,
+        losses.clip_fraction,
+        gradient_norm,
+        variance_explained(batch.return_, batch.value, batch.weight),
+        mean_target,
+        *head_statistics(rollout.vex, rollout.valid),
+        moved_threshold(rollout, hypers, config),
+        sound & jnp.all(jnp.isfinite(state.params)),
+        work,
+    )
+    return state, metrics
+
+
+def _means(
+    totals: Totals, batch: Batch, rollout: Rollout, parts: Parts
+) -> tuple[Losses, Array, Work]:
+    """Means over the steps taken, NaN if there was none; and the work done."""
+    config, sampler = parts.config, parts.rules.sampler
+    steps = totals.steps.astype(jnp.float32)
+    rows = config.rollout_steps * config.envs
+    full = rows // config.minibatches
+    size = minibatch_size(config.selection_mode, full, config.minibatches, drawn_length(parts))
+    epochs = totals.epochs.astype(jnp.float32)
+    looks: Any = 0.0
+    if sampler is not None and sampler.reads_policy:
+        looks = rows * (epochs if sampler.each_epoch else 1.0)
+    if config.recompute_advantages:
+        looks += rollout.vex.size * epochs
+    present = jnp.sum(batch.weight)
+    work = Work(
+        gradient_steps=steps,
+        sample_rate=totals.drawn / (epochs * present),
+        samples_forward=steps * size + looks,
+        samples_backward=steps * size,
+        effective_sample_size=totals.effective_size / steps,
+    )
+    losses = jax.tree.map(lambda x: x / steps, totals.losses)
+    return losses, totals.gradient_norm / steps, work
+
+
+def _all_work(batch: Batch, losses: Losses, parts: Parts) -> Work:
+    config = parts.config
+    effective = losses.effective_size
+    if effective is None:
+        effective = jnp.sum(batch.weight) / config.minibatches
+    steps, rows = config.epochs * config.minibatches, config.rollout_steps * config.envs
+    return Work(
+        gradient_steps=jnp.float32(steps),
+        sample_rate=jnp.float32(1.0),
+        samples_forward=jnp.float32(config.epochs * rows),
+        samples_backward=jnp.float32(config.epochs * rows),
+        effective_sample_size=effective,
+    )

@@ -1,0 +1,273 @@
+"""The update under a rule of selection: choose rows, then run as many minibatches as they fill.
+
+Without a rule `update.update_on_all` runs instead, so that PPO's bits are PPO's. Here the number of
+gradient steps is known only while the program runs. No gradient flows through that loop, and time
+is spent on the steps that are run. Members that are compiled together run the most steps of any.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
+from sauna.algorithm.learner.samples import recomputed
+from sauna.algorithm.learner.update import (
+    Parts,
+    gradient_step,
+    minibatch_advantage,
+    vex_targets,
+)
+from sauna.algorithm.selection.draws import (
+    draw,
+    effective_size,
+    minibatch_count,
+    minibatch_places,
+    minibatch_size,
+)
+from sauna.algorithm.types import (
+    Array,
+    Batch,
+    Choice,
+    Draw,
+    Hypers,
+    Rollout,
+    Samples,
+    TrainState,
+)
+from sauna.config.settings import Config
+
+
+class Totals(NamedTuple):
+    """Sums over the gradient steps of one iteration; `stopped` ends it."""
+
+    losses: Losses
+    gradient_norm: Array
+    steps: Array  # [] int32
+    effective_size: Array
+    drawn: Array  # [] rows of the policy loss, over epochs
+    epochs: Array  # [] int32 begun
+    stopped: Array  # [] bool
+
+
+def needs_selection(parts: Parts) -> bool:
+    """Whether something of a run's rules takes more than PPO's plain loop."""
+    config, rules = parts.config, parts.rules
+    masked = config.filter != "none" and config.dropped == "mask"
+    return masked or bool(rules.sampler or rules.stop) or config.recompute_advantages
+
+
+def update_on_selected(
+    state: TrainState,
+    batch: Batch,
+    rollout: Rollout,
+    hypers: Hypers,
+    order: Array,
+    key: Array,
+    *,
+    parts: Parts,
+) -> tuple[TrainState, Totals]:
+    """Epochs over the rows that the run's rule chooses.
+
+    Args:
+      batch: `[M]` samples; rollout: where they are from.
+      order: `[epochs, M]` int32, a permutation for each epoch.
+      key: of this iteration's draws.
+    """
+    sampler = parts.rules.sampler
+    choice = None
+    if sampler is None or not sampler.each_epoch:
+        state, choice = choose(state, batch, key, parts=parts)
+
+    def epoch(e: Array, carry: tuple[TrainState, Totals]) -> tuple[TrainState, Totals]:
+        state, totals = carry
+        now, chosen = batch, choice
+        epoch_key = jax.random.fold_in(key, e + 1)
+        if parts.config.recompute_advantages:
+            value = parts.policy.apply(state.params, rollout.observation).value
+            now = recomputed(batch, rollout, value, hypers, config=parts.config)
+        if chosen is None:
+            state, chosen = choose(state, now, epoch_key, parts=parts)
+        return _epoch(state, totals, now, chosen, hypers, order[e], epoch_key, parts=parts)
+
+    start = (state, _no_totals())
+    return jax.lax.fori_loop(0, parts.config.epochs, epoch, start)
+
+
+def choose(
+    state: TrainState, batch: Batch, key: Array, *, parts: Parts
+) -> tuple[TrainState, Choice]:
+    """What the run's sampler takes; every row that is present if it has none."""
+    sampler, present = parts.rules.sampler, batch.weight > 0
+    if sampler is None:
+        return state, Choice(keep=present, score=batch.weight)
+    standardized = standardize(batch.advantage, batch.weight)
+    error = batch.return_ - batch.value
+    samples = Samples(
+        present,
+        batch.observation,
+        batch.action,
+        batch.log_prob,
+        batch.advantage,
+        standardized,
+        batch.return_,
+        batch.value,
+        error,
+        batch.vex,
+    )
+    if sampler.reads_policy:
+        output = parts.policy.apply(state.params, batch.observation)
+        distribution = parts.policy.distribution
+        samples = samples._replace(
+            log_ratio=distribution.log_prob(output.policy, batch.action) - batch.log_prob,
+            policy=output.policy,
+            hidden=output.hidden,
+            entropy=distribution.entropy(output.policy),
+        )
+    carried, choice = sampler.choose(state.sampler, samples, key)
+    return state._replace(sampler=carried), choice
+
+
+def drawn_length(parts: Parts) -> int:
+    """K: the most rows that one epoch draws."""
+    config, sampler = parts.config, parts.rules.sampler
+    rows = config.rollout_steps * config.envs
+    if sampler is None or config.selection_losses == "policy":
+        return rows
+    return min(rows, max(1, math.ceil(sampler.share * rows - 1e-6)))
+
+
+def _drawn(choice: Choice, batch: Batch, order: Array, key: Array, parts: Parts) -> Draw:
+    """One epoch's rows. If a rule touches the policy loss alone, the critic sees all rows."""
+    present = batch.weight > 0
+    if parts.config.selection_losses == "policy":
+        if choice.probability is None:
+            choice = Choice(keep=present)
+        else:
+            choice = choice._replace(value_probability=present / jnp.sum(present))
+    return draw(choice, order, key, drawn_length(parts))
+
+
+def _epoch(
+    state: TrainState,
+    totals: Totals,
+    batch: Batch,
+    choice: Choice,
+    hypers: Hypers,
+    order: Array,
+    key: Array,
+    *,
+    parts: Parts,
+) -> tuple[TrainState, Totals]:
+    config = parts.config
+    drawn = _drawn(choice, batch, order, key, parts)
+    mode, full = config.selection_mode, len(order) // config.minibatches
+    size = minibatch_size(mode, full, config.minibatches, drawn_length(parts))
+    steps = minibatch_count(mode, drawn.number, full, config.minibatches)
+    begun = ~totals.stopped & (steps > 0)
+    kept = drawn.number
+    if choice.probability is None:
+        kept = jnp.sum(choice.keep, dtype=jnp.int32)
+    totals = totals._replace(
+        drawn=totals.drawn + jnp.where(begun, kept, 0), epochs=totals.epochs + begun
+    )
+    batch = _standardized(batch, choice, config)
+
+    def goes_on(now: tuple[Array, TrainState, Totals]) -> Array:
+        return (now[0] < steps) & ~now[2].stopped
+
+    def step(now: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
+        i, state, totals = now
+        places, counts = minibatch_places(mode, i, drawn.number, size, config.minibatches)
+        part = minibatch(batch, choice, drawn, places, counts, parts=parts)
+        after, losses, norm = gradient_step(state, part, hypers, parts=parts)
+        return i + 1, *_counted(totals, state, after, losses, norm, part)
+
+    _, state, totals = jax.lax.while_loop(goes_on, step, (jnp.int32(0), state, totals))
+    return state, totals
+
+
+def _standardized(batch: Batch, choice: Choice, config: Config) -> Batch:
+    """Advantages as the loss uses them, if they are standardised over more than a minibatch."""
+    if not config.normalize_advantages or config.normalize_over == "minibatch":
+        return batch
+    over = batch.weight
+    if config.normalize_over == "kept" and choice.keep is not None:
+        over = over * choice.keep
+    return batch._replace(advantage=standardize(batch.advantage, over))
+
+
+def minibatch(
+    batch: Batch, choice: Choice, drawn: Draw, places: Array, counts: Array, *, parts: Parts
+) -> Minibatch:
+    """The rows of one gradient step with the weights that the choice gives them.
+
+    Args:
+      places: `[B]` among the rows drawn; counts: `[B]` bool, False for a place left empty.
+    """
+    index, value_index = drawn.rows[places], drawn.value_rows[places]
+    rows = _rows(batch, index, counts)
+    separate = choice.value_probability is not None or (
+        choice.probability is not None and parts.config.selection_losses == "policy"
+    )
+    value_rows = _rows(batch, value_index, counts) if separate else rows
+    mask = rows.weight
+    if choice.keep is not None and parts.config.selection_losses == "policy":
+        mask = mask * choice.keep[index]
+    advantage = minibatch_advantage(rows._replace(weight=mask), parts.config)
+    return Minibatch(
+        rows=rows,
+        value_rows=value_rows,
+        advantage=advantage,
+        vex_target=vex_targets(value_rows, parts.target),
+        policy_mask=mask,
+        policy_scale=None if choice.weight is None else choice.weight[index],
+        value_mask=value_rows.weight,
+        value_scale=None if choice.value_weight is None else choice.value_weight[value_index],
+    )
+
+
+def _rows(batch: Batch, index: Array, counts: Array) -> Batch:
+    part = jax.tree.map(lambda x: x[index], batch)
+    part = part._replace(weight=part.weight * counts)
+    if part.next_weight is None:
+        return part
+    return part._replace(next_weight=part.next_weight * counts)
+
+
+def _counted(
+    totals: Totals,
+    before: TrainState,
+    after: TrainState,
+    losses: Losses,
+    norm: Array,
+    part: Minibatch,
+) -> tuple[TrainState, Totals]:
+    """Takes the step and counts it, unless the stop rule says that it is one too many."""
+    stop = jnp.bool_(False) if losses.stop is None else losses.stop
+    effective = losses.effective_size
+    if effective is None:
+        scale = 1.0 if part.policy_scale is None else part.policy_scale
+        effective = effective_size(part.policy_mask * scale)
+    more = Totals(
+        jax.tree.map(jnp.add, totals.losses, losses._replace(stop=None, effective_size=None)),
+        totals.gradient_norm + norm,
+        totals.steps + 1,
+        totals.effective_size + effective,
+        totals.drawn,
+        totals.epochs,
+        totals.stopped,
+    )
+    chosen: Any = jax.tree.map(
+        lambda new, old: jnp.where(stop, old, new), (after, more), (before, totals)
+    )
+    return chosen[0], chosen[1]._replace(stopped=totals.stopped | stop)
+
+
+def _no_totals() -> Totals:
+    zero = jnp.float32(0.0)
+    losses = Losses(zero, zero, zero, zero, zero, zero, zero)
+    return Totals(losses, zero, jnp.int32(0), zero, jnp.int32(0), jnp.int32(0), jnp.bool_(False))

@@ -1,0 +1,72 @@
+"""Minibatches drawn by how large a row's gradient is."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
+
+
+def gradient_norm(setup: SamplerSetup, uniform: float = 0.1, share: float = 1.0) -> Sampler:
+    """Draws by the norm of the surrogate's gradient at the policy head, without bias.
+
+    `p = (1 - uniform) g / sum g + uniform / M`, the policy term weighted by exactly `1 / (M p)`.
+    With `z = (a - mu) / sigma` and h the last hidden layer:
+
+        Gaussian     g = |A^| sqrt(sum_j (z_j/sigma_j)^2 (|h|^2 + 1) + sum_j (z_j^2 - 1)^2)
+        categorical  g = |A^| sqrt(sum_c (1 - 2 pi_a + sum_i pi_i^2)) sqrt(|h|^2 + 1)
+
+    summed over the components c of a factored action. The value loss draws rows of its own, by
+    `|R - V|`. After Katharopoulos & Fleuret 2018.
+    """
+
+    def mixed(score: Array, present: Array) -> Array:
+        score, even = score * present, present / jnp.sum(present)
+        total = jnp.sum(score)
+        found = jnp.where(total > 0, score / jnp.where(total > 0, total, 1.0), even)
+        return (1.0 - uniform) * found + uniform * even
+
+    def choose(state: tuple[()], samples: Samples, key: Array) -> tuple[tuple[()], Choice]:
+        present = samples.present
+        head = head_gradient(setup, samples.policy, samples.action, samples.hidden)
+        score = jnp.abs(samples.standardized) * head
+        p = mixed(score, present)
+        value_p = mixed(jnp.abs(samples.error), present)
+        number = jnp.sum(present)
+        return state, Choice(
+            probability=p,
+            weight=_inverse(number * p),
+            value_probability=value_p,
+            value_weight=_inverse(number * value_p),
+            score=score,
+        )
+
+    return Sampler(lambda: (), choose, share=share, reads_policy=True)
+
+
+def _inverse(x: Array) -> Array:
+    return jnp.where(x > 0, 1.0 / jnp.where(x > 0, x, 1.0), 0.0)
+
+
+def head_gradient(setup: SamplerSetup, policy: Array, action: Array, hidden: Array) -> Array:
+    """The norm of `grad log pi(a | s)` at the policy head `[M]`, for weights, biases and log-std.
+
+    Args:
+      policy: `[M, K]` parameters of the distribution; action: `[M, A]`; hidden: `[M, H]`.
+    """
+    above = jnp.sum(hidden**2, -1) + 1.0
+    if setup.action_kind == "continuous":
+        mean, log_std = jnp.split(policy, 2, -1)
+        z = (action - mean) * jnp.exp(-log_std)
+        weights = jnp.sum((z * jnp.exp(-log_std)) ** 2, -1) * above
+        return jnp.sqrt(weights + jnp.sum((z**2 - 1.0) ** 2, -1))
+    if setup.action_kind == "multi_binary":  # d log pi / d logit = a - sigmoid(logit)
+        return jnp.sqrt(jnp.sum((action - jax.nn.sigmoid(policy)) ** 2, -1) * above)
+    total, start = jnp.zeros(len(hidden)), 0
+    for c, size in enumerate(setup.action_sizes):
+        pi = jax.nn.softmax(policy[:, start : start + size], -1)
+        taken = jnp.take_along_axis(pi, action[:, c : c + 1].astype(jnp.int32), -1)[:, 0]
+        total += 1.0 - 2.0 * taken + jnp.sum(pi**2, -1)
+        start += size
+    return jnp.sqrt(total * above)

@@ -1,0 +1,33 @@
+"""Minibatches drawn by the size of the advantage."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
+
+FLOOR = 1e-6  # so that a row of advantage 0 can be drawn
+
+
+def prioritized(
+    setup: SamplerSetup, power: float = 0.8, correction: float = 0.2, share: float = 1.0
+) -> Sampler:
+    """Draws by `p = (|A| + 1e-6)^power / sum`, with replacement.
+
+    The policy term of a row is multiplied by `(M p)^-b / max`, the maximum over all rows; value
+    and entropy are not weighted. `b` rises from `correction` to 1 over the budget. Source:
+    PufferLib 3, after Schaul et al. 2016; there it works on segments of 64 steps, without
+    replacement, and `b` never reaches 1.
+    """
+
+    def choose(count: Array, samples: Samples, key: Array) -> tuple[Array, Choice]:
+        size = (jnp.abs(samples.advantage) + FLOOR) ** power * samples.present
+        p = size / jnp.sum(size)
+        progress = jnp.minimum(count / max(setup.iterations - 1, 1), 1.0)
+        b = correction + (1.0 - correction) * progress
+        number = jnp.sum(samples.present)
+        weight = jnp.where(samples.present, (number * jnp.where(p > 0, p, 1.0)) ** -b, 0.0)
+        choice = Choice(probability=p, weight=weight / jnp.max(weight), score=size)
+        return count + 1, choice
+
+    return Sampler(lambda: jnp.int32(0), choose, share=share)

@@ -1,0 +1,44 @@
+"""`seed` and `batch_size`, which other trainers have, as the fields that they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sauna.config.other_names import ACCEPTED
+from sauna.config.parsing import read_value
+from sauna.config.presets import arm_config, parse_all
+from sauna.system.errors import BadInput
+
+
+def translate(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Replaces `seed` (the one seed) and `batch_size` (samples per minibatch) by our fields.
+
+    Raises:
+      BadInput: one is given beside the field that it replaces, or does not divide the rollout.
+    """
+    found = {name: value for name, value in values.items() if name not in ACCEPTED}
+    if values.get("seed") is not None:
+        _refuse_both(values, "seed", "seeds")
+        found["seeds"] = (_whole("seed", values["seed"]),)
+    if values.get("batch_size") is not None:
+        _refuse_both(values, "batch_size", "minibatches")
+        size = _whole("batch_size", values["batch_size"])
+        config = arm_config("ppo", parse_all({k: v for k, v in found.items() if v is not None}))
+        samples = config.rollout_steps * config.envs
+        if size < 1 or samples % size:
+            raise BadInput(f"batch_size: {size} does not divide rollout_steps x envs = {samples}")
+        found["minibatches"] = samples // size
+    return found
+
+
+def _refuse_both(values: Mapping[str, Any], name: str, ours: str) -> None:
+    if values.get(ours) is not None:
+        raise BadInput(f"{name}: give either {name} or {ours}, not both")
+
+
+def _whole(name: str, value: Any) -> int:
+    try:
+        return int(read_value(name, value, int))
+    except (ValueError, TypeError):
+        raise BadInput(f"{name}: cannot read {value!r} as a whole number") from None

@@ -1,0 +1,141 @@
+"""What is refused of a run's settings: what nothing reads, and what does not go together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sauna.config.plugins import import_name, is_local
+from sauna.config.settings import FIELDS, Config, fields_with
+from sauna.system.errors import BadInput
+
+
+def is_read(name: str, config: Config) -> bool:
+    """Returns whether a run with this config reads field `name`."""
+    read_when = FIELDS[name].metadata["read_when"]
+    return read_when is None or bool(read_when[1](config))
+
+
+def check_read(configs: list[Config], names: Iterable[str]) -> None:
+    """Refuses a named field that none of the arms' `configs` reads.
+
+    Raises:
+      BadInput: naming the field and what would read it.
+    """
+    for name in names:
+        if not any(is_read(name, config) for config in configs):
+            arms = ",".join(configs[0].arm)
+            needed = FIELDS[name].metadata["read_when"][0]
+            raise BadInput(f"{name}: not read by arm {arms}; it needs {needed}")
+
+
+def check_read_here(config: Config, spaces: Any, overrides: Mapping[str, Any]) -> None:
+    """Refuses what the place and the spaces of the environment leave unread.
+
+    Args:
+      config: with the place decided.
+      spaces: of the environment.
+      overrides: what the user gives, parsed; to turn something off is never refused.
+
+    Raises:
+      BadInput: naming the field and what would read it.
+    """
+    for name, value in overrides.items():
+        meta = FIELDS[name].metadata
+        if meta["device_only"] and config.backend != "device":
+            raise BadInput(f"{name}: only read with backend device")
+        needs = meta["needs_spaces"]
+        if needs is not None and value is not False and not needs[1](spaces):
+            raise BadInput(f"{name}: not read by {config.env}; it needs {needs[0]}")
+
+
+def check_consistent(config: Config) -> None:
+    """Refuses values that are each possible but not together.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if not config.env:
+        raise BadInput("env: no environment given; try `sauna train InvertedPendulum-v5`")
+    if not config.seeds:
+        raise BadInput("seeds: empty; give a number of seeds or a list")
+    if len(set(config.seeds)) != len(config.seeds):
+        raise BadInput("seeds: a seed is given twice")
+    if not config.hidden:
+        raise BadInput("hidden: empty; give at least one width")
+    if min(config.seeds) < 0 or max(config.seeds) >= 2**32:
+        raise BadInput("seeds: must lie between 0 and 2**32 - 1")
+    batch = config.rollout_steps * config.envs
+    if batch % config.minibatches:
+        raise BadInput(
+            f"minibatches: {config.minibatches} does not divide rollout_steps x envs = {batch}"
+        )
+    if config.steps < batch:
+        raise BadInput(f"steps: {config.steps} is less than one rollout of {batch} steps")
+    if config.gae_over == "kept" and config.truncation == "bootstrap":
+        raise BadInput(
+            "gae_over: kept needs truncation=terminate (the final value belongs to a step that "
+            "may have been dropped)"
+        )
+    if config.keep_rate_target and (config.history, config.decision) != ("all", "env"):
+        raise BadInput("keep_rate_target: needs history=all and decision=env")
+    if config.drop_rate and config.drop_rate_from:
+        raise BadInput("drop_rate: give either drop_rate or drop_rate_from, not both")
+    if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):
+        raise BadInput("drop_rate: random-drop needs a rate, or drop_rate_from=RUN")
+    if config.env_processes and "env" in local_parts(config):
+        raise BadInput(
+            "env_processes: the environment cannot be imported by another process; "
+            "put it at the top level of a module"
+        )
+    if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
+        raise BadInput("env_processes: more worker processes than environments")
+    check_rules(config)
+    for name in own_parts(config):
+        import_name(name, getattr(config, name))
+
+
+def check_rules(config: Config) -> None:
+    """Refuses rules of selection that cannot work together.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    stages = [
+        name for name in ("filter", "sampler", "loss_weight") if getattr(config, name) != "none"
+    ]
+    if config.control != "none":
+        if not stages:
+            raise BadInput("control: needs a rule to follow: a filter, a sampler or a loss_weight")
+        if len(stages) > 1:
+            raise BadInput(f"control: {' and '.join(stages)} are two rules; it can follow one")
+        if stages == ["loss_weight"] and config.control not in ("random", "reversed"):
+            raise BadInput(
+                f"control: a loss_weight is controlled by random or reversed, not by "
+                f"{config.control}"
+            )
+        if config.filter == "random-drop":
+            raise BadInput("control: random-drop is a control itself")
+    if config.gae_over == "kept":
+        unfit = [("control", "none"), ("critic", "squared"), ("recompute_advantages", False)]
+        for name, plain in unfit:
+            if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
+                raise BadInput(f"{name}: needs gae_over=all")
+    if config.algorithm == "a2c" and config.stop != "none":
+        raise BadInput("stop: A2C makes one pass, which nothing stops early")
+    if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
+        raise BadInput(
+            "objective: unclipped needs a stop rule (espo) or a loss_weight "
+            "(sample-dropout): nothing else bounds the ratio"
+        )
+
+
+def local_parts(config: Config) -> list[str]:
+    """Names the fields whose values were passed by value and only this process knows."""
+    return [name for name in FIELDS if is_local(str(getattr(config, name)))]
+
+
+def own_parts(config: Config) -> list[str]:
+    """Names the fields that hold a part of the user's own besides the environment."""
+    names = (name for name in fields_with("plugin") if name != "env")
+    return [name for name in names if ":" in getattr(config, name)]

@@ -1,0 +1,399 @@
+"""Every choice of a run, as one flat frozen dataclass.
+
+The dataclass is the single source of the command line's flags and help lines, of `config.json`,
+and of the keyword arguments of `sauna.train`. Nothing here imports JAX, so that bad input is
+refused in well under a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from sauna.config import readers
+from sauna.config.fields import option
+
+FILTERS = ("none", "sauna", "random-drop")
+SAMPLERS = (
+    "none",
+    "gigaflow",
+    "top-advantage",
+    "prioritized",
+    "gradient-norm",
+    "kondo",
+    "positive",
+    "pods",
+    "vex-oracle",
+)
+VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
+NETWORKS = ("auto", "mlp", "nature-cnn")
+
+_task = partial(option, group="task")
+_run = partial(option, group="run", shapes_program=False)
+_where = partial(option, group="where it runs", shapes_program=False)
+_learning = partial(option, group="learning")
+_network = partial(option, group="network")
+_normalisation = partial(option, group="normalisation")
+_selection = partial(option, group="selection")
+_rule = partial(option, group="selection", rule_of_experiment=True)
+_update = partial(option, group="update rules")
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of one run; see each field's help line. Built by `resolve`, never by hand."""
+
+    env: str = _task(
+        "",
+        "Gymnasium id, or module:function that makes an environment",
+        common=True,
+        plugin=True,
+        decided_by_study=True,
+    )
+    env_kwargs: str = _task("{}", "keyword arguments of the environment, as a JSON object")
+    arm: tuple[str, ...] = _run(
+        ("ppo",), "what to train, a name or several: see `sauna list arms`", common=True
+    )
+    algorithm: str = _run(
+        "ppo",
+        "how the policy is improved: by PPO, or by A2C",
+        choices=("ppo", "a2c"),
+        shapes_program=True,
+    )
+    preset: str = _run("mujoco", "settings to start from; with A2C, preset a2c", common=True)
+    seeds: tuple[int, ...] = _run(
+        (0,),
+        "how many seeds (6: seeds 0 to 5; 42: 42 of them), or which ones (100,101,110)",
+        common=True,
+    )
+    steps: int = _run(
+        1_000_000, "env steps per member", at_least=1, common=True, shapes_program=True
+    )
+
+    out: str = _run(
+        "",
+        "run directory; none: runs/ENV_ARM_SEEDS_TIME",
+        common=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+    processes: int = _where(
+        0,
+        "processes that share the members (0: one per core)",
+        at_least=0,
+        common=True,
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+    env_processes: int = _where(
+        0,
+        "worker processes that step the environments of one process (0: stepped in-process)",
+        at_least=0,
+        read_when=readers.ON_HOST,
+        resumable=True,
+    )
+    backend: str = _where(
+        "auto",
+        "what steps the environments (auto: the fastest with the same "
+        "numbers; device: inside the compiled program)",
+        choices=("auto", "gymnasium", "device"),
+        resumable=True,
+    )
+    reset: str = _where(
+        "fresh",
+        "on the device, an episode starts in a new state, or in its environment's first one again",
+        choices=("fresh", "cached"),
+        shapes_program=True,
+        device_only=True,
+    )
+    device: str = _where(
+        "auto",
+        "with backend device: gpu if there is one (auto), or the CPU",
+        choices=("auto", "cpu", "gpu"),
+        common=True,
+        device_only=True,
+        resumable=True,
+    )
+    devices: int = _where(
+        0,
+        "devices that share the population (0: every GPU, or one CPU; 8 simulates 8 on a CPU)",
+        at_least=0,
+        device_only=True,
+        resumable=True,
+    )
+    distributed: str = _where(
+        "",
+        "HOST:PORT,COUNT,INDEX: COUNT machines train together; INDEX 0 writes the run",
+        device_only=True,
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+    env_timeout: float = _where(
+        60.0,
+        "seconds to wait for an environment worker",
+        above=0,
+        read_when=readers.WORKERS,
+        resumable=True,
+    )
+    checkpoint_every: int = _run(50, "iterations between checkpoints", at_least=1, resumable=True)
+    keep_checkpoints: int = _run(
+        2,
+        "how many of the newest checkpoints to keep",
+        at_least=1,
+        resumable=True,
+        machine_local=True,
+    )
+    tensorboard: bool = _run(
+        False,
+        "also write the metrics for TensorBoard",
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+
+    envs: int = _learning(1, "environments per member (N)", at_least=1, common=True)
+    rollout_steps: int = _learning(
+        2048, "kept steps per environment and iteration (T)", at_least=1, common=True
+    )
+    minibatches: int = _learning(32, "minibatches per epoch", at_least=1, read_when=readers.PPO)
+    epochs: int = _learning(10, "passes over each rollout", at_least=1, read_when=readers.PPO)
+    learning_rate: float = _learning(
+        3e-4, "the optimizer's step size", above=0, common=True, shapes_program=False
+    )
+    learning_rate_schedule: str = _learning(
+        "linear", "over the budget of steps: to 0, or constant", choices=("linear", "constant")
+    )
+    optimizer: str = _learning("adam", "what scales the gradient", choices=("adam", "rmsprop"))
+    adam_epsilon: float = _learning(1e-5, "Adam's epsilon", above=0, read_when=readers.ADAM)
+    rmsprop_epsilon: float = _learning(
+        1e-5, "RMSProp's epsilon, under the root", above=0, read_when=readers.RMSPROP
+    )
+    rmsprop_decay: float = _learning(
+        0.99,
+        "of RMSProp's running mean square",
+        at_least=0,
+        at_most=0.999999,
+        read_when=readers.RMSPROP,
+    )
+    max_grad_norm: float = _learning(
+        0.5, "the gradient is scaled down to this global norm", above=0, shapes_program=False
+    )
+    clip_range: float = _learning(
+        0.2,
+        "clip range of the probability ratio (and the value)",
+        above=0,
+        shapes_program=False,
+        read_when=readers.PPO,
+    )
+    clip_value: bool = _learning(
+        True, "clip the value function's change as the ratio's", read_when=readers.PPO
+    )
+    normalize_advantages: bool = _learning(True, "standardise the advantages of each minibatch")
+    entropy_coef: float = _learning(
+        0.0, "weight of the entropy bonus", at_least=0, shapes_program=False
+    )
+    value_coef: float = _learning(0.5, "weight of the value loss", at_least=0, shapes_program=False)
+    gamma: float = _learning(0.99, "discount", at_least=0, at_most=1, shapes_program=False)
+    gae_lambda: float = _learning(
+        0.95, "lambda of the advantage estimate", at_least=0, at_most=1, shapes_program=False
+    )
+
+    network: str = _network(
+        "auto", "trunk (auto: nature-cnn for images, else mlp)", choices=NETWORKS, plugin=True
+    )
+    hidden: tuple[int, ...] = _network(
+        (64, 64), "widths of the MLP's hidden layers", at_least=1, read_when=readers.MLP
+    )
+    activation: str = _network(
+        "tanh", "the MLP's activation", choices=("tanh", "relu"), read_when=readers.MLP
+    )
+    trunk: str = _network(
+        "separate", "whether policy and value share a trunk", choices=("separate", "shared")
+    )
+    log_std_init: float = _network(
+        0.0, "first log standard deviation of continuous actions", needs_spaces=readers.CONTINUOUS
+    )
+    normalize_observations: bool = _normalisation(
+        True,
+        "running mean and variance of vector observations (images are divided by 255)",
+        needs_spaces=readers.VECTORS,
+    )
+    sign_rewards: bool = _normalisation(
+        False, "learn from each reward's sign, -1, 0 or 1 (returns are reported in full)"
+    )
+    normalize_rewards: bool = _normalisation(
+        True, "divide rewards by the std of the discounted return"
+    )
+    clip_observations: float = _normalisation(
+        10.0, "bound of normalised observations", above=0, read_when=readers.NORMALIZED
+    )
+    clip_rewards: float = _normalisation(
+        10.0, "bound of normalised rewards", above=0, read_when=readers.SCALED
+    )
+
+    vex_target: str = _rule(
+        "sample",
+        "what the Vex head regresses",
+        choices=VEX_TARGETS,
+        plugin=True,
+        read_when=readers.VEX,
+    )
+    vex_coef: float = _selection(
+        0.5, "weight of the Vex loss (c2 of eq. 6)", at_least=0, shapes_program=False
+    )
+    filter: str = _rule("sauna", "which transitions the update keeps", choices=FILTERS, plugin=True)
+    sampler: str = _selection(
+        "none",
+        "which of the rollout's samples the update learns from, once advantages are known",
+        choices=SAMPLERS,
+        plugin=True,
+    )
+    sampler_kwargs: str = _selection(
+        "{}", "arguments of the sampler, as a JSON object", read_when=readers.SAMPLER
+    )
+    control: str = _selection(
+        "none",
+        "instead of what the rule takes, as many samples in each iteration: at random, every "
+        "k-th, those of smallest |advantage|, or those that the rule wants least",
+        choices=("none", "random", "stride", "low-advantage", "reversed"),
+    )
+    selection_mode: str = _selection(
+        "fewer",
+        "fewer gradient steps on minibatches of the same size, as many steps on smaller ones, or "
+        "as many of the same size, refilled with what was taken",
+        choices=("fewer", "smaller", "refill"),
+        read_when=readers.MASKED,
+    )
+    selection_losses: str = _selection(
+        "all",
+        "the sampler chooses for all losses, or for the policy loss alone",
+        choices=("all", "policy"),
+        read_when=readers.SAMPLER,
+    )
+    normalize_over: str = _update(
+        "minibatch",
+        "what advantages are standardised over",
+        choices=("minibatch", "rollout", "kept"),
+        read_when=readers.STANDARDISED,
+    )
+    advantage_sign: str = _update(
+        "both",
+        "learn from all advantages, or from max(0, A) / std(A)",
+        choices=("both", "positive"),
+    )
+    objective: str = _update(
+        "clip",
+        "the policy term: PPO's clip, SPO's penalty, or neither",
+        choices=("clip", "spo", "unclipped"),
+        read_when=readers.PPO,
+    )
+    loss_weight: str = _update(
+        "none",
+        "what weighs each policy term of a minibatch",
+        choices=("none", "delight", "sample-dropout"),
+        plugin=True,
+    )
+    loss_weight_kwargs: str = _update(
+        "{}", "arguments of the loss weight, as a JSON object", read_when=readers.WEIGHTED
+    )
+    stop: str = _update(
+        "none",
+        "what ends an iteration's updates early",
+        choices=("none", "target-kl", "espo"),
+        plugin=True,
+        read_when=readers.PPO,
+    )
+    stop_kwargs: str = _update(
+        "{}", "arguments of the stop rule, as a JSON object", read_when=readers.STOPPED
+    )
+    critic: str = _update(
+        "squared",
+        "the value loss: squared errors, or their variance (AVEC)",
+        choices=("squared", "avec"),
+    )
+    recompute_advantages: bool = _update(
+        False, "compute values and advantages anew before each epoch", read_when=readers.PPO
+    )
+    auxiliary: str = _update(
+        "none",
+        "a head that is trained along to predict the next observation, or, as MERL's released "
+        "code does, that of another row",
+        choices=("none", "next-observation", "shuffled-observation"),
+    )
+    auxiliary_coef: float = _update(
+        0.01, "weight of the auxiliary loss", at_least=0, read_when=readers.AUXILIARY
+    )
+    threshold: float = _selection(
+        0.3,
+        "keep if |Vex| / |median| reaches this (eq. 7)",
+        at_least=0,
+        shapes_program=False,
+        read_when=readers.THRESHOLD,
+    )
+    threshold_schedule: str = _rule(
+        "constant",
+        "over the budget of steps: constant, rising from 0, or falling to 0",
+        choices=("constant", "rising", "falling"),
+        read_when=readers.THRESHOLD,
+    )
+    keep_rate_target: float = _rule(
+        0.0,
+        "share of steps to keep; the threshold is moved at every step to hold it (0: off)",
+        at_least=0,
+        at_most=1,
+        read_when=readers.SAUNA,
+    )
+    history: str = _rule(
+        "all",
+        "steps of the rollout whose predictions the median covers",
+        choices=("all", "kept"),
+        read_when=readers.SAUNA,
+    )
+    decision: str = _rule(
+        "env",
+        "decide for each env, or jointly for a vector step",
+        choices=("env", "joint"),
+        read_when=readers.SEVERAL,
+    )
+    dropped: str = _rule(
+        "replace",
+        "dropped steps: replaced by further env steps, or masked",
+        choices=("replace", "mask"),
+        read_when=readers.FILTERED,
+    )
+    max_env_steps_factor: int = _rule(
+        4,
+        "with replace: at most this many times T env steps are tried",
+        at_least=1,
+        read_when=readers.REPLACED,
+    )
+    gae_over: str = _rule(
+        "all", "advantages over all env steps, or over the kept ones", choices=("all", "kept")
+    )
+    truncation: str = _learning(
+        "bootstrap",
+        "at a time limit: bootstrap the final value, or treat it as termination",
+        choices=("bootstrap", "terminate"),
+        rule_of_experiment=True,
+    )
+    budget: str = _rule(
+        "env", "what `steps` counts: all env steps or kept ones", choices=("env", "kept")
+    )
+    drop_rate: float = _selection(
+        0.0,
+        "share of steps that random-drop drops",
+        at_least=0,
+        at_most=0.99,
+        shapes_program=False,
+        read_when=readers.RANDOM,
+    )
+    drop_rate_from: str = _selection(
+        "",
+        "a SAUNA run whose measured rates random-drop repeats, seed by seed",
+        shapes_program=False,
+        read_when=readers.RANDOM,
+        machine_local=True,
+        decided_by_study=True,
+    )

@@ -1,0 +1,121 @@
+"""What other trainers call a setting, and what it is called here.
+
+Of Stable-Baselines3, CleanRL, rsl_rl and Brax. `seed` and `batch_size` are accepted as they are
+(see `accepted.py`); another name is answered with the one that means the same, as the values may
+count otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sauna.config.settings import FIELDS, flag
+from sauna.system.errors import nearest
+
+SAME = {
+    "env_id": "env",
+    "task": "env",
+    "environment": "env",
+    "total_timesteps": "steps",
+    "num_timesteps": "steps",
+    "timesteps": "steps",
+    "n_envs": "envs",
+    "num_envs": "envs",
+    "n_steps": "rollout_steps",
+    "num_steps": "rollout_steps",
+    "num_steps_per_env": "rollout_steps",
+    "unroll_length": "rollout_steps",
+    "num_minibatches": "minibatches",
+    "num_mini_batches": "minibatches",
+    "minibatch_size": "batch_size",
+    "n_epochs": "epochs",
+    "update_epochs": "epochs",
+    "num_learning_epochs": "epochs",
+    "num_updates_per_batch": "epochs",
+    "lr": "learning_rate",
+    "anneal_lr": "learning_rate_schedule",
+    "schedule": "learning_rate_schedule",
+    "clip_coef": "clip_range",
+    "clip_param": "clip_range",
+    "clipping_epsilon": "clip_range",
+    "clip_vloss": "clip_value",
+    "clip_range_vf": "clip_value",
+    "use_clipped_value_loss": "clip_value",
+    "norm_adv": "normalize_advantages",
+    "normalize_advantage": "normalize_advantages",
+    "ent_coef": "entropy_coef",
+    "entropy_cost": "entropy_coef",
+    "vf_coef": "value_coef",
+    "value_loss_coef": "value_coef",
+    "discounting": "gamma",
+    "lam": "gae_lambda",
+    "rms_prop_eps": "rmsprop_epsilon",
+    "use_rms_prop": "optimizer",
+    "net_arch": "hidden",
+    "policy_kwargs": "hidden",
+    "actor_hidden_dims": "hidden",
+    "critic_hidden_dims": "hidden",
+    "activation_fn": "activation",
+    "init_noise_std": "log_std_init",
+    "norm_obs": "normalize_observations",
+    "empirical_normalization": "normalize_observations",
+    "norm_reward": "normalize_rewards",
+    "reward_scaling": "normalize_rewards",
+    "clip_obs": "clip_observations",
+    "clip_reward": "clip_rewards",
+    "episode_length": "env_kwargs",
+    "action_repeat": "env_kwargs",
+    "tensorboard_log": "tensorboard",
+    "track": "tensorboard",
+    "wandb_project_name": "tensorboard",
+    "save_interval": "checkpoint_every",
+    "save_freq": "checkpoint_every",
+    "exp_name": "out",
+    "experiment_name": "out",
+    "run_name": "out",
+    "log_dir": "out",
+    "cuda": "device",
+    "n_seeds": "seeds",
+}
+ADVICE = {
+    "target_kl": "`--stop target-kl` stops an iteration by its KL divergence",
+    "desired_kl": "there is no step size by KL divergence here; see learning_rate_schedule",
+    "max_iterations": "give steps: iterations x envs x rollout_steps",
+    "num_iterations": "give steps: iterations x envs x rollout_steps",
+    "capture_video": "`sauna eval RUN --video` films a trained policy",
+    "torch_deterministic": "a run repeats itself to the bit by itself",
+    "verbose": "`quiet=True` in Python shows nothing",
+    "use_sde": "there is no state-dependent exploration here",
+    "policy": "the policy follows from the spaces; `network` chooses its trunk",
+}
+ACCEPTED = ("seed", "batch_size")
+
+
+def key_hint(name: str) -> str:
+    """Writes `; ...` with what an unknown keyword or key should be."""
+    return _hint(name, lambda ours: ours) or nearest(name, FIELDS)
+
+
+def flag_hint(argument: str, known: list[str], command: str | None) -> str:
+    """Writes `; ...` with what an unknown argument of `command` should be.
+
+    Args:
+      argument: as it was typed.
+      known: the flags of the command.
+    """
+    typed = argument.split("=")[0]
+    name = typed.lstrip("-").removeprefix("no-").replace("-", "_")
+    if command == "resume" and SAME.get(name, name) in (*FIELDS, *ACCEPTED):
+        return (
+            "; a resumed run computes what it began with: "
+            "`sauna train --config RUN/config.json` trains anew with other settings"
+        )
+    return _hint(name, flag) or nearest(typed, known)
+
+
+def _hint(name: str, spell: Any) -> str:
+    if name in SAME:
+        ours = SAME[name]
+        text = FIELDS[ours].metadata["help"] if ours in FIELDS else "samples per minibatch"
+        return f"; here it is {spell(ours)!r}: {text}"
+    return f"; {ADVICE[name]}" if name in ADVICE else ""

@@ -1,0 +1,42 @@
+"""What reads a field that not every run reads: in words, and as a predicate.
+
+Of a `Config`, or of an environment's `Spaces` for `needs_spaces`; see `fields.option`.
+"""
+
+from __future__ import annotations
+
+ON_HOST = ("environments on the host", lambda c: c.backend != "device")
+WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
+PPO = ("algorithm ppo", lambda c: c.algorithm == "ppo")
+ADAM = ("optimizer adam", lambda c: c.optimizer == "adam")
+RMSPROP = ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")
+MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
+CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
+VECTORS = (
+    "vector observations: others have no running moments",
+    lambda spaces: spaces.observation_kind == "vector",
+)
+NORMALIZED = ("normalize_observations", lambda c: c.normalize_observations)
+SCALED = ("normalize_rewards", lambda c: c.normalize_rewards)
+VEX = ("vex_coef above 0", lambda c: c.vex_coef > 0)
+FILTERED = ("a filter", lambda c: c.filter != "none")
+REPLACED = (
+    "a filter with dropped=replace",
+    lambda c: c.filter != "none" and c.dropped == "replace",
+)
+THRESHOLD = (
+    "a filter other than none and random-drop, and keep_rate_target 0",
+    lambda c: c.filter not in ("none", "random-drop") and not c.keep_rate_target,
+)
+SAUNA = ("filter sauna", lambda c: c.filter == "sauna")
+SEVERAL = ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1)
+RANDOM = ("filter random-drop", lambda c: c.filter == "random-drop")
+SAMPLER = ("a sampler", lambda c: c.sampler != "none")
+MASKED = (
+    "a sampler, or a filter with dropped=mask",
+    lambda c: c.sampler != "none" or (c.filter != "none" and c.dropped == "mask"),
+)
+STANDARDISED = ("normalize_advantages", lambda c: c.normalize_advantages)
+WEIGHTED = ("a loss_weight", lambda c: c.loss_weight != "none")
+STOPPED = ("a stop rule", lambda c: c.stop != "none")
+AUXILIARY = ("an auxiliary head", lambda c: c.auxiliary != "none")

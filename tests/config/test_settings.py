@@ -1,0 +1,71 @@
+"""What is said of a setting at the setting is what the checks, resuming and studies read."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from sauna.config import presets
+from sauna.config.checks import check_read, check_read_here, is_read
+from sauna.config.fields import GROUPS
+from sauna.config.settings import FIELDS, FILTERS, VEX_TARGETS, Config, fields_with
+from sauna.envs.spaces import Spaces
+from sauna.system.errors import BadInput
+
+DISCRETE = Spaces("vector", (3,), "discrete", (2,), "", "")
+PICTURES = Spaces("image", (84, 84, 4), "continuous", (2,), "", "")
+
+
+def test_every_field_has_a_group_and_ten_or_so_come_first() -> None:
+    assert {field.metadata["group"] for field in FIELDS.values()} == set(GROUPS)
+    assert 8 <= len(fields_with("common")) <= 12
+
+
+@pytest.mark.parametrize("name", [n for n, f in FIELDS.items() if f.metadata["read_when"]])
+def test_a_field_that_nothing_reads_is_refused_with_what_would_read_it(name: str) -> None:
+    unread = dataclasses.replace(
+        Config(),
+        algorithm="a2c" if name not in ("rmsprop_epsilon", "rmsprop_decay") else "ppo",
+        optimizer="rmsprop" if name == "adam_epsilon" else "adam",
+        backend="device",
+        network="nature-cnn",
+        filter="none",
+        vex_coef=0.0,
+        normalize_observations=False,
+        normalize_rewards=False,
+        normalize_advantages=False,
+    )
+    needed = FIELDS[name].metadata["read_when"][0]
+    assert not is_read(name, unread)
+    with pytest.raises(BadInput) as refused:
+        check_read([unread], [name])
+    assert str(refused.value).startswith(f"{name}: not read by arm") and needed in str(
+        refused.value
+    )
+
+
+def test_what_place_and_spaces_leave_unread() -> None:
+    host, device = Config(), dataclasses.replace(Config(), backend="device")
+    for name in fields_with("device_only"):
+        with pytest.raises(BadInput, match="only read with backend device"):
+            check_read_here(host, DISCRETE, {name: 1})
+        check_read_here(device, DISCRETE, {name: 1})
+    with pytest.raises(BadInput, match=r"log_std_init: not read by .*continuous actions"):
+        check_read_here(host, DISCRETE, {"log_std_init": 1.0})
+    check_read_here(host, PICTURES, {"log_std_init": 1.0})
+    with pytest.raises(BadInput, match="no running moments"):
+        check_read_here(host, PICTURES, {"normalize_observations": True})
+    check_read_here(host, PICTURES, {"normalize_observations": False})
+    check_read_here(host, DISCRETE, {"normalize_observations": True})
+
+
+def test_what_resume_may_change_shapes_no_program() -> None:
+    assert not set(fields_with("resumable")) & set(fields_with("shapes_program"))
+
+
+def test_every_choice_that_has_a_name_has_a_help_line() -> None:
+    assert set(presets.CONTROL_HELP) == set(presets.CONTROLS)
+    assert set(presets.FILTER_HELP) == set(FILTERS) and set(presets.TARGET_HELP) == set(VEX_TARGETS)
+    assert set(presets.ARM_HELP) == set(presets.ARMS)
+    assert set(presets.PRESET_HELP) == set(presets.PRESETS)

@@ -1,0 +1,36 @@
+"""What is known of a study before it is trained is said before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sauna.experiments.statistics import compare, least_seeds
+from sauna.experiments.study.command import comparison
+from sauna.experiments.study.notes import before_training
+
+ARMS = ("ppo", "vex-head", "random-drop", "sauna")
+
+
+@pytest.mark.parametrize("arms", [ARMS, ("ppo", "sauna")])
+def test_a_comparison_of_too_few_seeds_is_named_underpowered(arms: tuple[str, ...]) -> None:
+    needed = least_seeds(len(arms) - 1)
+    for number in range(2, needed + 2):
+        spec = comparison("x", arms, {"seeds": tuple(range(number))})
+        said = before_training(spec)
+        assert bool(said) == (number < needed)
+        assert all(f"--seeds {needed}" in line and "underpowered" in line for line in said)
+
+
+def test_it_says_so_exactly_when_no_result_could_be_found() -> None:
+    """An oracle: even scores that are all above the baseline's give no verdict."""
+    for number in (3, 4, 5):
+        above = {str(arm): (np.arange(number) + 100.0, np.arange(number) * 1.0) for arm in range(3)}
+        kinds = {found.kind for found in compare(above).values()}
+        spec = comparison("x", ARMS, {"seeds": tuple(range(number))})
+        assert (kinds == {"too few"}) == bool(before_training(spec))
+
+
+def test_many_seeds_may_have_been_one_seed() -> None:
+    said = before_training(comparison("x", ("ppo", "sauna"), {"seeds": tuple(range(42))}))
+    assert said == ["note: 42 seeds, 0 to 41; for the one seed 42 write --seed 42"]
