@@ -107,7 +107,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     inspect.add_argument("--out", metavar="PAGE", help=text)
     text = "leave the pictures out: needs no renderer"
     inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
-    text = "the most likely action (default: sampled, as in training)"
+    text = "the most likely action (default: sampled)"
     for command in (evaluate, inspect):
         command.add_argument("run", metavar="RUN", help="run directory")
         command.add_argument("--deterministic", action="store_true", help=text)
@@ -182,7 +182,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _fail(message: object, code: int) -> NoReturn:
-    """Ends with one line, below the frames of the user's own code if that raised."""
+    """Prints one line, below the frames of the user's own code if that raised; exits."""
     if isinstance(message, SaunaError) and (frames := user_frames(message)):
         print(frames, file=sys.stderr)
     print(f"sauna: {printable(str(message))}", file=sys.stderr)
@@ -259,18 +259,15 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    path, inexact = Path(values.pop("run")), values.pop("inexact")
-    trust, accept = values.pop("trust"), values.pop("accept_changed_code")
+    path = Path(values.pop("run"))
+    inexact, *how = (values.pop(name) for name in ("inexact", "trust", "accept_changed_code"))
     display = make_display()
-    run = runs.reopen(path, values, display, trust, accept)
+    run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)
 
 
 def _eval(values: dict[str, Any]) -> None:
-    run = Path(values.pop("run"))
-    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("PJRT_NPROC", "1")
+    run = _played(values)
     from sauna.experiments.evaluate.episodes import choose_renderer, evaluate
 
     if values["video"]:
@@ -292,14 +289,19 @@ def _eval(values: dict[str, Any]) -> None:
 
 
 def _inspect(values: dict[str, Any]) -> None:
-    run = Path(values.pop("run"))
-    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("PJRT_NPROC", "1")
+    run = _played(values)
     from sauna.experiments.inspect.command import inspect
 
     path = inspect(run, **values, say=_say)
     print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)")
+
+
+def _played(values: dict[str, Any]) -> Path:
+    """Reads what `eval` and `inspect` share; the run. One thread of the CPU plays."""
+    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("PJRT_NPROC", "1")
+    return Path(values.pop("run"))
 
 
 def _whole(values: dict[str, Any], name: str, least: int) -> int:

@@ -105,8 +105,6 @@ def _configs() -> dict[str, Case]:
     for name, values in settings.items():
         for number, value in enumerate(values):
             found[f"setting {name}, {number}"] = ("resume", _put("config", name, value=value))
-    for name, value in (("arm", [HTML]), ("seeds", [0] * 600_000), (HTML, 1), ("env", None)):
-        found[f"given {name}"] = ("resume", _put("given", name, value=value))
     odd = {"shape of 2**40": [2**40], "negative": [-1], "text": "4", "bool": [True], "deep": [[4]]}
     for what, shape in odd.items():
         spaces = [SPACES[0], shape, *SPACES[2:]]

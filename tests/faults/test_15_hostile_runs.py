@@ -96,9 +96,9 @@ def _study(run: Path) -> None:
 
 def _train(run: Path) -> None:
     """What `sauna train --config FILE` does first."""
-    from sauna.cli import _given_from
+    from sauna.cli import _overrides_in
 
-    _given_from(str(run / "config.json"), False)
+    _overrides_in(str(run / "config.json"), False)
 
 
 OPENERS = {"resume": _resume, "eval": _eval, "study": _study, "train": _train}

@@ -31,12 +31,15 @@ def read_value(name: str, value: Any, field_type: Any) -> Any:
     if typing.get_origin(field_type) is tuple:
         item = typing.get_args(field_type)[0]
         parts = value.split(",") if isinstance(value, str) else list(value)
+        if len(parts) > MAX_VALUES:
+            raise BadInput(f"{name}: {len(parts)} values are too many; at most {MAX_VALUES}")
         return tuple(str(part).strip() if item is str else _integer(part) for part in parts)
     if not isinstance(value, str):
         raise TypeError
     return value
 
 
+MAX_VALUES = 100  # of a list, such as the arms or the widths of layers
 _BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
