@@ -239,11 +239,7 @@ def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
 
 
 def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
-    """Reads the settings of a `config.json` (of a run), or of a JSON file of plain settings.
-
-    Raises:
-      BadInput: it cannot be read, or names code of somebody else's, which `trust` allows.
-    """
+    """Reads the settings of a `config.json` (of a run), or of a JSON file of plain settings."""
     if file is None:
         return {}
     from sauna.config.trust import check_trusted
@@ -299,8 +295,7 @@ def _inspect(values: dict[str, Any]) -> None:
 def _played(values: dict[str, Any]) -> Path:
     """Reads what `eval` and `inspect` share; the run. One thread of the CPU plays."""
     values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("PJRT_NPROC", "1")
+    os.environ |= {"JAX_PLATFORMS": "cpu", "PJRT_NPROC": "1", **os.environ}
     return Path(values.pop("run"))
 
 
