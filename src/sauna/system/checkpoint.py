@@ -24,7 +24,7 @@ from safetensors.numpy import load, save
 
 from sauna.system.errors import SaunaError
 from sauna.system.migrations import with_arms
-from sauna.system.safe_read import JSON_BYTES, Untrusted, check_tensors, parse_object, read_file
+from sauna.system.safe_read import JSON_BYTES, Untrusted, check_header, parse_object, read_file
 from sauna.system.safe_write import own_folder, sync_folder, write_durably
 
 FORMAT = 2
@@ -167,9 +167,9 @@ def load_checkpoint(
         blob = read_file(path / "state.safetensors", min(manifest["bytes"], LARGEST))
         if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
             raise Untrusted("state.safetensors is not what was written (SHA-256 differs)")
-        check_tensors(blob)
+        check_header(blob)
         return Checkpoint(path, manifest, load(blob))
-    except (Untrusted, SafetensorError) as error:
+    except (Untrusted, SafetensorError, KeyError) as error:  # KeyError: a type that numpy lacks
         raise BadCheckpoint(f"{path}: {error}") from error
 
 
