@@ -47,7 +47,7 @@ def serve(recorder: Recorder, inbox: Connection, outlet: Connection) -> None:
         reporter, iteration = PipeReporter(inbox, outbox, dies_alone=False), start
         while iteration < ITERATIONS and reporter.allowance(iteration):
             timing = {"seconds": 1.0, "collect_seconds": 0.5, "env_steps": 32}
-            timing |= {"collect_cpu_seconds": 0.5, "update_cpu_seconds": 0.5}
+            timing |= {"collect_cpu_seconds": 0.5, "update_cpu_seconds": {}}
             reporter.iteration(iteration, [recorder.rows[iteration]], timing)
             iteration += 1
             if iteration % SAVED["checkpoint_every"] == 0:
