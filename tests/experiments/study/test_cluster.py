@@ -206,7 +206,7 @@ def test_a_checkpoint_never_counts_on_more_than_has_arrived(tmp_path, monkeypatc
         left[0] -= 1
         path.write_bytes(data)
 
-    monkeypatch.setattr(ray_files.run_directory, "write_durably", failing)
+    monkeypatch.setattr(ray_files.safe_write, "write_durably", failing)
     for writes in range(5):
         shutil.rmtree(here, ignore_errors=True)
         left[0] = writes

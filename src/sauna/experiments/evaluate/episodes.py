@@ -19,6 +19,7 @@ from sauna.experiments.evaluate.play import Episode, Progress, play
 from sauna.experiments.evaluate.video import film
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.system.working_folder import kept_folder
 
 
 class VideoFailure(SaunaError):
@@ -29,6 +30,7 @@ class VideoFailure(SaunaError):
         self.result = result
 
 
+@kept_folder()
 def evaluate(
     run: str | Path,
     *,
@@ -41,6 +43,7 @@ def evaluate(
     checkpoint: int | None = None,
     max_steps: int = MAX_STEPS,
     video: bool = False,
+    trust: bool = False,
     say: Callable[[str], None] = print,
     **parts: Any,
 ) -> dict[str, Any]:
@@ -59,6 +62,7 @@ def evaluate(
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       max_steps: env steps after which an episode that has not ended is cut.
       video: also films the first member's first episode.
+      trust: the code that the run names may run, even if another user named it.
       say: is called with a line about checkpoints that cannot be trusted, progress, and episodes
         that were cut.
       **parts: those that were passed by value when the run started (`network`, ...).
@@ -70,11 +74,11 @@ def evaluate(
       BadInput: no such run, member or checkpoint, impossible numbers, or `env` has other spaces.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
-    run = Path(run)
+    run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    artifact = load_artifact(run, say, checkpoint, trust=trust)
     env = _provided(run, env, parts)
-    artifact = load_artifact(run, say, checkpoint)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]
     own = artifact.config.env
     mode = "deterministic" if deterministic else "sampled"
