@@ -1,4 +1,4 @@
-"""A run interrupted anywhere and resumed ends with the bytes of a run left alone."""
+"""A run interrupted any_member and resumed ends with the bytes of a run left alone."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class Collecting(NamedTuple):
     env: JaxEnv  # flat
     policy: Policy
     filter: StepFilter | None
-    anywhere: Callable[[Array], Array]  # see `jax_env.advance`
+    any_member: Callable[[Array], Array]  # see `jax_env.advance`
 
 
 class _Row(NamedTuple):
@@ -137,10 +137,10 @@ def collect(
       limit: env steps that each environment may try, at least T.
     """
     config = parts.config
-    room = capacity(config)
+    max_rows = capacity(config)
     noise = _noise(parts, keys.action, iteration)
     filter_key = jax.random.fold_in(keys.filter, iteration)
-    filter_state = parts.filter.init(config.envs, room) if parts.filter else ()
+    filter_state = parts.filter.init(config.envs, max_rows) if parts.filter else ()
     carry = _Carry(jnp.int32(0), state, filter_state, jnp.zeros(config.envs, jnp.int32))
     begun = _finite_rows(state.envs.observation)  # the run's first ones no step has looked at
 
@@ -149,10 +149,10 @@ def collect(
         key = jax.random.fold_in(filter_key, carry.t)
         return _step(parts, params, carry, noise[carry.t], acting, keys.env, key, hypers)
 
-    if room == config.rollout_steps:  # every env acts in every row: a plain scan
-        carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=room)
+    if max_rows == config.rollout_steps:  # every env acts in every row: a plain scan
+        carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=max_rows)
     else:
-        carry, rows = _until_full(parts, step, carry, room, limit)
+        carry, rows = _until_full(parts, step, carry, max_rows, limit)
     return _finish(parts, params, carry.state, rows, begun, hypers)
 
 
@@ -160,7 +160,7 @@ def _until_full(
     parts: Collecting,
     step: Callable[[_Carry], tuple[_Carry, _Row]],
     carry: _Carry,
-    room: int,
+    max_rows: int,
     limit: Array,
 ) -> tuple[_Carry, _Row]:
     """`step` until all environments are full or `limit` rows are written; the rest stays 0.
@@ -170,17 +170,17 @@ def _until_full(
     """
     wanted = parts.config.rollout_steps
     shapes = jax.eval_shape(step, carry)[1]
-    empty = jax.tree.map(lambda row: jnp.zeros((room, *row.shape), row.dtype), shapes)
+    empty = jax.tree.map(lambda row: jnp.zeros((max_rows, *row.shape), row.dtype), shapes)
 
-    def goes_on(now: tuple[_Carry, _Row]) -> Array:
-        return parts.anywhere(jnp.any(now[0].kept < wanted) & (now[0].t < limit))
+    def continues(now: tuple[_Carry, _Row]) -> Array:
+        return parts.any_member(jnp.any(now[0].kept < wanted) & (now[0].t < limit))
 
     def write(now: tuple[_Carry, _Row]) -> tuple[_Carry, _Row]:
         carry, row = step(now[0])
         at = now[0].t
         return carry, jax.tree.map(lambda rows, x: rows.at[at].set(x), now[1], row)
 
-    return jax.lax.while_loop(goes_on, write, (carry, empty))
+    return jax.lax.while_loop(continues, write, (carry, empty))
 
 
 def _noise(parts: Collecting, key: Array, iteration: Array) -> Array:
@@ -219,12 +219,12 @@ def _step(
         scored = ScoredStep(observation, action, log_prob, output.value, output.vex)
         filter_state, decided = parts.filter.keep(carry.filter, scored, filter_key, hypers)
         keep = decided & acting
-    envs, told = advance(parts.env, state.envs, action, acting, env_key, parts.anywhere)
+    envs, transition = advance(parts.env, state.envs, action, acting, env_key, parts.any_member)
     moments = state.observation_moments
     if isinstance(moments, LongMoments):
         moments = update_long_moments(moments, envs.observation, acting)
-    reward = jnp.where(acting, told.reward, 0.0)
-    ended = told.terminated | told.truncated
+    reward = jnp.where(acting, transition.reward, 0.0)
+    ended = transition.terminated | transition.truncated
     episode_return = state.episode_return + reward
     episode_length = state.episode_length + acting
     after = state._replace(
@@ -239,15 +239,15 @@ def _step(
         policy.distribution.log_prob(output.policy, action),
         reward,
         output.value,
-        _final_values(parts, params, moments, told),
+        _final_values(parts, params, moments, transition),
         output.vex,
-        told.terminated,
-        told.truncated,
+        transition.terminated,
+        transition.truncated,
         acting,
         keep,
         episode_return,
         episode_length,
-        ~acting | _finite_rows(told.observation, envs.observation, reward),
+        ~acting | _finite_rows(transition.observation, envs.observation, reward),
     )
     return _Carry(carry.t + 1, after, filter_state, carry.kept + keep), row
 
@@ -259,18 +259,18 @@ def _finite_rows(*arrays: Array) -> Array:
 
 
 def _final_values(
-    parts: Collecting, params: Array, moments: LongMoments | tuple[()], told: Transition
+    parts: Collecting, params: Array, moments: LongMoments | tuple[()], transition: Transition
 ) -> Array:
     """V `[N]` of what truncated episodes had reached; 0 elsewhere, and computed only for some."""
     if parts.config.truncation != "bootstrap":
-        return jnp.zeros(told.reward.shape)
+        return jnp.zeros(transition.reward.shape)
 
     def values() -> Array:
-        return parts.policy.apply(params, _seen(parts, moments, told.observation)).value
+        return parts.policy.apply(params, _seen(parts, moments, transition.observation)).value
 
-    some = parts.anywhere(jnp.any(told.truncated))
-    found = jax.lax.cond(some, values, lambda: jnp.zeros(told.reward.shape))
-    return jnp.where(told.truncated, found, 0.0)
+    some = parts.any_member(jnp.any(transition.truncated))
+    found = jax.lax.cond(some, values, lambda: jnp.zeros(transition.reward.shape))
+    return jnp.where(transition.truncated, found, 0.0)
 
 
 def _finish(

@@ -16,7 +16,7 @@ from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.experiments.evaluate.play import Episode, Progress, play
-from sauna.experiments.evaluate.video import film
+from sauna.experiments.evaluate.video import record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.working_folder import kept_folder
@@ -61,7 +61,7 @@ def evaluate(
       env_kwargs: keyword arguments of the environment: on the run's own, they change the run's.
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       max_steps: env steps after which an episode that has not ended is cut.
-      video: also films the first member's first episode.
+      video: also records the first member's first episode.
       trust: the code that the run names may run, even if another user named it.
       say: is called with a line about checkpoints that cannot be trusted, progress, and episodes
         that were cut.
@@ -92,20 +92,20 @@ def evaluate(
     kwargs = kwargs_of(artifact, env, env_kwargs)
     if env_kwargs:
         result["env_kwargs"] = kwargs
-    world = make_env(result["env"], kwargs)
-    check_spaces(artifact, world)
+    made = make_env(result["env"], kwargs)
+    check_spaces(artifact, made)
     from sauna.experiments.evaluate.policy import TrainedPolicy  # imports JAX, so after the checks
 
     for name in chosen:
-        policy = TrainedPolicy(artifact, name, world)
+        policy = TrainedPolicy(artifact, name, made)
         progress = Progress(name, episodes, say)
         played = [
-            progress.played(play(policy, world, deterministic, seed + i, progress.step, max_steps))
+            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played)
         progress.say_cut(max_steps)
-    close(world)
+    close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
         run_directory.write_json(run / f"evaluation_{mode}.json", result)
     if video:
@@ -114,7 +114,9 @@ def evaluate(
         )
         path = run / "videos" / f"{label}.mp4"
         try:
-            film(path, artifact, chosen[0], result["env"], kwargs, deterministic, seed, max_steps)
+            record_video(
+                path, artifact, chosen[0], result["env"], kwargs, deterministic, seed, max_steps
+            )
         except SaunaError as error:
             raise VideoFailure(str(error), result) from error
         result["video"] = str(path)

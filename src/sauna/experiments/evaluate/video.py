@@ -21,7 +21,7 @@ from sauna.system.errors import SaunaError, one_line
 from sauna.system.safe_write import own_folder, replacing
 
 
-def film(
+def record_video(
     path: Path,
     artifact: Artifact,
     member: str,
@@ -31,7 +31,7 @@ def film(
     seed: int,
     max_steps: int,
 ) -> None:
-    """Films one episode to an mp4 file; without an episode there is no file.
+    """Records one episode to an mp4 file; without an episode there is no file.
 
     Raises:
       SaunaError: the environment cannot render on this machine, or gives no pictures.

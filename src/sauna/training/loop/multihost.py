@@ -111,7 +111,7 @@ def split_over_devices(members: int, envs: int, devices: int) -> tuple[int, int]
 
 
 def check_split(name: str, members: int, envs: int, devices: int) -> None:
-    """Refuses devices of which some would be idle.
+    """Refuses devices of which some would have no work.
 
     Raises:
       BadInput: the field `name` asked for them.
