@@ -38,7 +38,7 @@ FIGURES = PAGES / "figures"
 STILLS = FIGURES / "fig5_stills.png"
 CURVES_OF_RETURNS = "learning_curves"  # the figure's name
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
-SHOWN_PLOTS = ("noise_variance", "dial_coverage")  # of the measurements, those on a page
+SHOWN_PLOTS = ("noise_variance", "sweep_coverage")  # of the measurements, those on a page
 POINTS = 30  # of each curve that are committed
 SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8")  # in the README's figure
 
@@ -97,9 +97,9 @@ def collect_measured(name: str) -> None:
         text = json.dumps(rounded(found), separators=(",", ":"))
         text = text.replace('{"task"', '\n{"task"') + "\n"
         (ROOT / "results" / f"{name}.json").write_text(text)
-    if (place / "figures" / "stills.png").exists():
+    if (place / "figures" / "frames.png").exists():
         STILLS.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(place / "figures" / "stills.png", STILLS)
+        shutil.copy(place / "figures" / "frames.png", STILLS)
 
 
 def insert(path: Path, name: str, text: str) -> None:
@@ -119,7 +119,7 @@ def figure(name: str, results: Mapping[str, Any], summary: Mapping[str, Any]) ->
 
 def measured_figures(name: str, measured: Mapping[str, Any]) -> None:
     """The figures of a measurement that a page shows, as PNG."""
-    extra = MEASURED[name].extra(measured)
+    extra = MEASURED[name].report(measured)
     plots = [plot for plot in extra.plots if plot.name in SHOWN_PLOTS]
     with tempfile.TemporaryDirectory() as folder:
         for path in draw_plots(plots, extra.looks, Path(folder)).values():

@@ -162,7 +162,7 @@ def _beside_controls(marks: Any) -> list[list[str]]:
             continue
         arm, shown, apart = arms[control.drops_like], [], []
         for key, name in zip(coverage_report.ASKED, ("entropy", "coverage", "return"), strict=True):
-            estimate = coverage_report.beside_coin(arm, control, key)
+            estimate = coverage_report.beside_control(arm, control, key)
             shown.append(noise_report.shown(estimate))
             if estimate.low is not None and not estimate.low <= 0 <= estimate.high:
                 apart.append(name)

@@ -61,7 +61,7 @@ def again(arm: Arm, task: str, wanted: dict[int, int]) -> dict[int, dict[str, An
 
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        given = {**arm.given(task, tuple(wanted)), "out": str(run), "processes": 1}
+        given = {**arm.overrides(task, tuple(wanted)), "out": str(run), "processes": 1}
         process = UnitProcess(given, Path(folder) / "stderr.txt", hear)
         done.wait(SECONDS)
         process.stop()

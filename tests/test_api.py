@@ -46,6 +46,11 @@ def test_rows_hold_every_metric(result) -> None:
         "env_steps",
         "kept_steps",
         "keep_rate",
+        "gradient_steps",
+        "samples_forward",
+        "samples_backward",
+        "sample_rate",
+        "effective_sample_size",
         "episodes",
         "episode_returns",
         "episode_lengths",
@@ -64,11 +69,6 @@ def test_rows_hold_every_metric(result) -> None:
         "vex_spread",
         "vex_median",
         "learning_rate",
-        "gradient_steps",
-        "sample_rate",
-        "samples_forward",
-        "samples_backward",
-        "effective_sample_size",
     }
     for row in result.metrics:
         assert set(row) == expected
@@ -204,7 +204,7 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in run_directory.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
-    command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-pictures"]
+    command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-frames"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (page,) = (tmp_path / "run").glob("inspect_*.html")

@@ -396,3 +396,108 @@ class Lives(World):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
         told = super().step(action)
         return *told[:4], {"life_lost": self.t in (2, 4)}
+
+
+class Answering(Scripted):
+    """Its reward and its info are those given."""
+
+    def __init__(self, reward: Any = 1.0, info: Any = None) -> None:
+        self.given = np.array(reward), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Any]:
+        answer = super().step(action)
+        return answer[0], self.given[0], *answer[2:4], self.given[1]
+
+
+class SignedSeed(World):
+    """Observes its seed, which must fit a signed int; some say so in another way."""
+
+    def __init__(self, error: str = "ValueError") -> None:
+        self.error = error
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.t = 0
+        if seed is not None and seed >= 2**31:
+            if self.error == "fire":
+                raise ValueError("the motor is on fire")
+            raise {"ValueError": ValueError, "OverflowError": OverflowError}[self.error](
+                "seed too large" if self.error == "ValueError" else "cannot convert to C int"
+            )
+        return np.array([float(seed or 0)]), {}
+
+
+class Unclosable(Scripted):
+    """Cannot be closed; with `raises`, it cannot be played either."""
+
+    def __init__(self, error: str = "RuntimeError", raises: bool = False) -> None:
+        self.error, self.raises = error, raises
+
+    def reward(self, action: Any) -> float:
+        if self.raises:
+            raise ValueError("the motor is on fire")
+        return super().reward(action)
+
+    def close(self) -> None:
+        raise {"RuntimeError": RuntimeError, "SystemExit": SystemExit}[self.error]("stuck")
+
+
+class Never(World):
+    """An episode without an end; its pictures have odd sides, and nobody knows their rate."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": None}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None = None, size: int = 41, breaks: int = 0) -> None:
+        self.render_mode, self.size, self.breaks = render_mode, size, breaks
+
+    def terminated(self) -> bool:
+        return False
+
+    def render(self) -> np.ndarray | None:
+        if self.breaks and self.t >= self.breaks:
+            raise RuntimeError("the lamp is broken")
+        picture = np.full((self.size, self.size + 4, 3), 20 * (self.t % 10), np.uint8)
+        return picture if self.render_mode == "rgb_array" else None
+
+
+class Board(World):
+    """A 5 x 5 board of bytes up to 3."""
+
+    observation_space = spaces.Box(0, 3, (5, 5), np.uint8)
+    length = 4
+
+    def observe(self) -> np.ndarray:
+        return np.full((5, 5), self.t % 4, np.uint8)
+
+
+class Wide(World):
+    """The reward is higher the nearer the action is to 750 of [0, 1000]."""
+
+    action_space = spaces.Box(0.0, 1000.0, (1,), np.float32)
+
+    def reward(self, action: Any) -> float:
+        assert self.action_space.contains(action)
+        return -abs(float(action[0]) - 750.0) / 1000.0
+
+
+class Parts(World):
+    """Several parts, nested, as one observation."""
+
+    observation_space = spaces.Dict(
+        {
+            "hand": spaces.Tuple((spaces.Discrete(5, start=1), spaces.MultiBinary(2))),
+            "speed": spaces.Box(-1, 1, (2,), np.float32),
+        }
+    )
+    length = 4
+
+    def observe(self) -> Any:
+        hand = (1 + self.t % 5, np.array([1, 0], np.int8))
+        return {"hand": hand, "speed": np.array([0.5, -0.5], np.float32)}
+
+
+def make_vector(number: int = 2) -> Any:
+    """Not one environment, but several."""
+    return gymnasium.make_vec("CartPole-v1", num_envs=number)
+
+
+INSTANCE = Scripted()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -88,4 +89,10 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'sauna' has no attribute {name!r}")
     import importlib
 
+    if _HOMES[name] != "sauna.system.errors":
+        importlib.import_module("sauna.system.supported").check_system()
     return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+if "gymnasium" in sys.modules:  # as in `gymnasium.make("sauna:sauna/HumanoidFlagrunHarder-v0")`
+    import sauna.envs.flagrun  # noqa: F401 - registers it

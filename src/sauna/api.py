@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config import local
 from sauna.config.accepted import translate
-from sauna.config.plugins import is_local, name_of
+from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
 from sauna.config.settings import fields_with
+from sauna.envs.make import check_makes, known_in_this_process_alone
 from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
@@ -19,6 +20,23 @@ from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
 
 PARTS = fields_with("plugin")  # what a user may pass by value
+
+
+def _env_name(env: Any) -> str:
+    """Names an environment; an id that this program registered is a part of this process.
+
+    Raises:
+      BadInput: it is an environment itself, or makes none.
+    """
+    if isinstance(env, str):
+        if not known_in_this_process_alone(env):
+            return env
+        import gymnasium
+
+        return name_of(partial(gymnasium.make, env, disable_env_checker=True))
+    name = name_of(env)
+    check_makes(name, env)
+    return name
 
 
 class Result:
@@ -39,7 +57,7 @@ class Result:
 
     def policy(self, member: int | str = 0) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`."""
-        return load(self.path, member)
+        return load(self.path, member, trust=True)
 
     def __repr__(self) -> str:
         return f"Result({str(self.path)!r})"
@@ -64,7 +82,7 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
       BadInput: a setting is not usable; nothing was created.
       SaunaError: training failed; the last good checkpoint is on disk.
     """
-    overrides = translate({"env": name_of(env), **{n: _named(n, v) for n, v in settings.items()}})
+    overrides = translate({"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}})
     if overrides.get("out") is not None:
         overrides["out"] = str(overrides["out"])
     display: Display = _Silent() if quiet else make_display()
@@ -94,6 +112,7 @@ def compare(
     out: str | Path = "runs",
     processes: int = 0,
     quiet: bool = False,
+    accept_changed_code: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
     """Does filtering help on `env`? Trains the arms and says what the data support.
@@ -106,6 +125,7 @@ def compare(
       out: the folder of runs and results.
       processes: trainings at a time; 0: one per core.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
       **settings: of every run (`seeds=6`, `steps=1_000_000`).
 
     Returns:
@@ -117,7 +137,7 @@ def compare(
     """
     from sauna.experiments.study.command import compare_command, comparison, study
 
-    overrides = {"env": name_of(env), **{n: _named(n, v) for n, v in settings.items()}}
+    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
     for name in PARTS:
         if is_local(str(overrides.get(name))):
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
@@ -125,11 +145,18 @@ def compare(
     overrides = translate(overrides)
     spec = comparison(task, tuple(arms), parse_all(overrides))
     command = compare_command(task, tuple(arms), overrides, out)
-    return study(spec, Path(out), command, processes, quiet=quiet)
+    accept = accept_changed_code
+    return study(spec, Path(out), command, processes, quiet=quiet, accept_changed_code=accept)
 
 
 def resume(
-    path: str | Path, *, quiet: bool = False, inexact: bool = False, **changes: Any
+    path: str | Path,
+    *,
+    quiet: bool = False,
+    inexact: bool = False,
+    trust: bool = False,
+    accept_changed_code: bool = False,
+    **changes: Any,
 ) -> Result:
     """Continues an interrupted run to its end; the result is that of a run left alone.
 
@@ -137,48 +164,45 @@ def resume(
       path: the run directory.
       quiet: show nothing.
       inexact: start new episodes where environments cannot be brought back.
+      trust: the code that the run names may run, even if another user named it.
+      accept_changed_code: go on even if the code that the run names is not what it was.
       **changes: settings that do not touch what is computed (`processes`, ...), and the parts
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    rest = _provide(Path(path), changes)
-    run = runs.reopen(Path(path), rest, display)
+    rest = provide(Path(path), changes, PARTS)
+    run = runs.reopen(Path(path), rest, display, trust, accept_changed_code)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
-def load(path: str | Path, member: int | str = 0, **parts: Any) -> Any:
-    """The policy of a run's newest good checkpoint, as `policy(observation) -> action`.
+def load(
+    path: str | Path,
+    member: int | str = 0,
+    *,
+    checkpoint: int | None = None,
+    trust: bool = False,
+    **parts: Any,
+) -> Any:
+    """The policy of a run, as `policy(observation) -> action`.
 
     The action is the most likely one; `policy(observation, deterministic=False, key=...)` samples.
-    `parts` are those that were passed by value when the run started (`env`, `network`, ...).
+
+    Args:
+      path: the run directory.
+      member: name (`sauna/0`) or index.
+      checkpoint: the iteration of a kept checkpoint; default the newest good one.
+      trust: the code that the run names may run, even if another user named it.
+      **parts: those that were passed by value when the run started (`env`, `network`, ...).
     """
-    _provide(Path(path), parts)
     from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
-    return TrainedPolicy(load_artifact(Path(path)), member)
+    artifact = load_artifact(Path(path), iteration=checkpoint, trust=trust)
+    provide(Path(path), parts, PARTS)
+    return TrainedPolicy(artifact, member)
 
 
 def _named(name: str, value: Any) -> Any:
     """Names a part that was passed by value; other values stay."""
     return name_of(value) if name in PARTS and value is not None else value
-
-
-def _provide(path: Path, given: dict[str, Any]) -> dict[str, Any]:
-    """Puts parts passed by value where the run's config looks for them; returns the rest.
-
-    Raises:
-      BadInput: a part is given that the run finds by name, or one is missing.
-    """
-    config = run_directory.read_config(path).get("config", {})
-    for name in PARTS:
-        attribute = str(config.get(name)).partition(":")[2]
-        if is_local(str(config.get(name))):
-            if name in given:
-                setattr(local, attribute, given[name])
-            elif not hasattr(local, attribute):
-                raise BadInput(f"{name}: was passed by value; pass it again as {name}=...")
-        elif name in given:
-            raise BadInput(f"{name}: the run finds its own by name ({config.get(name)})")
-    return {name: value for name, value in given.items() if name not in PARTS}

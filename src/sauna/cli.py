@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | study | bench | list`.
+"""The command line: `sauna train | resume | eval | inspect | compare | plot | study | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -18,6 +18,7 @@ from sauna import __version__
 from sauna.config.accepted import translate
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint
+from sauna.config.parsing import whole_number
 from sauna.config.presets import (
     ARM_HELP,
     COMPARED,
@@ -32,7 +33,10 @@ from sauna.config.presets import (
 )
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
-from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.experiments.evaluate import MAX_STEPS
+from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
+from sauna.system.supported import check_system
+from sauna.system.tracebacks import user_frames
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
 # Where a comparison or a study trains.
@@ -55,6 +59,10 @@ _PLACE: dict[str, dict[str, Any]] = {
     "address": {
         "default": "",
         "help": "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)",
+    },
+    "accept_changed_code": {
+        "action": "store_true",
+        "help": "go on with runs whose environment's or plug-in's code is not what it was",
     },
 }
 
@@ -89,31 +97,35 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
     )
-    evaluate.add_argument("run", metavar="RUN", help="run directory")
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
-    text = "the most likely action (default: sampled, as in training)"
-    evaluate.add_argument("--deterministic", action="store_true", help=text)
-    evaluate.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
-    evaluate.add_argument("--video", action="store_true", help="film the first episode")
+    text = "keyword arguments of the environment, as a JSON object; they change the run's own"
+    evaluate.add_argument("--env-kwargs", metavar="JSON", help=text)
+    text = "the iteration of a kept checkpoint (default: the newest)"
+    evaluate.add_argument("--checkpoint", metavar="N", help=text)
+    evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
-    inspect.add_argument("run", metavar="RUN", help="run directory")
     inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
     inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")
-    text = "the most likely action (default: sampled, as in training)"
-    inspect.add_argument("--deterministic", action="store_true", help=text)
-    inspect.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
-    text = "leave the pictures out: needs no renderer"
-    inspect.add_argument("--no-pictures", action="store_false", dest="pictures", help=text)
+    text = f"env steps after which an episode is cut (default {MAX_STEPS})"
+    for command in (evaluate, inspect):
+        command.add_argument("--max-steps", metavar="N", default=str(MAX_STEPS), help=text)
+        most_likely = "the most likely action (default: sampled, as in training)"
+        command.add_argument("--deterministic", action="store_true", help=most_likely)
+        command.add_argument("--seed", default="0", help="seed of the first episode (default 0)")
+    text = "leave the frames out: needs no renderer"
+    inspect.add_argument("--no-frames", action="store_false", dest="frames", help=text)
 
     text = "does filtering help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
-    compare.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
+    text = f"{FIELDS['env'].metadata['help']}; or runs that exist, as `plot` reads them"
+    compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
+    compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=text)
@@ -121,14 +133,23 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     filtered = {**shown_values(arguments, "sauna"), "seeds": COMPARED_SEEDS}
     add_fields(compare, free, filtered)
 
-    study = commands.add_parser(
-        "study", help="run a study of the paper's, or your own", allow_abbrev=False
-    )
+    text = "run a study of the paper's, or your own"
+    study = commands.add_parser("study", help=text, allow_abbrev=False)
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
+    text = "run the code that the file or run names, even if another user named it"
+    for command in (train, resume, evaluate, inspect, study):
+        command.add_argument("--trust", action="store_true", help=text)
+    resume.add_argument("--accept-changed-code", **_PLACE["accept_changed_code"])
     for command in (compare, study):
         place = command.add_argument_group("where it trains")
         for name, how in _PLACE.items():
             place.add_argument(flag(name), **how)
+
+    text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
+    plot = commands.add_parser("plot", help=text, allow_abbrev=False)
+    plot.add_argument("runs", nargs="+", metavar="RUN")
+    plot.add_argument("--out", default="", metavar="FILE", help="the figure, .png or .svg")
+    plot.add_argument("--tag", default="", help="of the returns in TensorBoard files")
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, usage=usage % "bench", allow_abbrev=False)
@@ -176,11 +197,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _fail(message: object, code: int) -> NoReturn:
-    print(f"sauna: {message}", file=sys.stderr)
+    """Prints one line, below the frames of the user's own code if that raised; exits."""
+    if isinstance(message, SaunaError) and (frames := user_frames(message)):
+        print(frames, file=sys.stderr)
+    print(f"sauna: {printable(str(message))}", file=sys.stderr)
     sys.exit(code)
 
 
 def _run(arguments: list[str]) -> None:
+    check_system()
     parser = make_parser(arguments)
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
@@ -210,7 +235,7 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    stored = _overrides_in(values.pop("config"))
+    stored = _overrides_in(values.pop("config"), values.pop("trust"))
     env = values.pop("env")
     overrides = _over(stored, values | ({"env": env} if env else {}))
     display = make_display()
@@ -229,13 +254,15 @@ def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
     return translate({k: v for k, v in stored.items() if k not in gone} | typed)
 
 
-def _overrides_in(file: str | None) -> dict[str, Any]:
+def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
     """Reads the settings of a `config.json` (of a run), or of a JSON file of plain settings."""
     if file is None:
         return {}
+    from sauna.config.trust import check_trusted
     from sauna.system.run_directory import read_config_file
 
     stored = read_config_file(Path(file))
+    check_trusted(stored, file, stored.pop("seal", None), trust)
     return overrides_of(read_stored(stored)) if "config" in stored else stored
 
 
@@ -244,58 +271,60 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    path, inexact = Path(values.pop("run")), values.pop("inexact")
+    path = Path(values.pop("run"))
+    inexact, *how = (values.pop(name) for name in ("inexact", "trust", "accept_changed_code"))
     display = make_display()
-    run = runs.reopen(path, values, display)
+    run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)
 
 
 def _eval(values: dict[str, Any]) -> None:
     run = Path(values.pop("run"))
-    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("PJRT_NPROC", "1")
-    from sauna.experiments.evaluate.episodes import choose_renderer, evaluate
+    _set_up_playing(values)
+    from sauna.experiments.evaluate.episodes import VideoFailure, evaluate, report
+    from sauna.experiments.evaluate.video import choose_renderer
 
     if values["video"]:
         choose_renderer()
-    result = evaluate(run, **values)
-    print(
-        f"{result['env']}, {result['mode']} actions, frozen normaliser, "
-        f"checkpoint of iteration {result['iteration']}"
-    )
-    for name, row in result["members"].items():
-        print(
-            f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
-            f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
-            f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
-            f"{row['episodes']} episodes"
-        )
+    try:
+        result = evaluate(run, **values)
+    except VideoFailure as error:
+        print("\n".join(report(error.result)), flush=True)
+        raise
+    print("\n".join(report(result)))
     if "video" in result:
         print(f"video: {result['video']}")
 
 
-def _inspect(values: dict[str, Any]) -> None:
-    run = Path(values.pop("run"))
-    values |= {"episodes": _whole(values, "episodes", 1), "seed": _whole(values, "seed", 0)}
+def _set_up_playing(values: dict[str, Any]) -> None:
+    """Reads the numbers of `eval` and `inspect`, and keeps JAX to one thread of the CPU."""
+    least = {"episodes": 1, "seed": 0, "max_steps": 1}
+    if values.get("checkpoint") is not None:
+        least["checkpoint"] = 0
+    values |= {name: whole_number(values, name, number) for name, number in least.items()}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
+
+
+def _inspect(values: dict[str, Any]) -> None:
+    run = Path(values.pop("run"))
+    _set_up_playing(values)
     from sauna.experiments.inspect.command import inspect
 
     path = inspect(run, **values, say=_say)
     print(f"page: {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
-def _whole(values: dict[str, Any], name: str, least: int) -> int:
-    if not values[name].isdigit() or int(values[name]) < least:
-        raise BadInput(f"{name}: must be a whole number of at least {least}")
-    return int(values[name])
-
-
 def _compare(values: dict[str, Any]) -> None:
+    from sauna.experiments.report.sources import is_source
     from sauna.experiments.study.command import compare_command, comparison
+    from sauna.experiments.study.existing import compare_existing
 
-    env, arms = values.pop("env"), tuple(values.pop("arms").split(","))
+    names, tag = values.pop("env"), values.pop("tag")
+    if len(names) > 1 or tag or any(is_source(Path(name)) for name in names):
+        print("\n".join(compare_existing([*map(Path, names)], tag, **values)))
+        return
+    env, arms = names[0] if names else "", tuple(values.pop("arms").split(","))
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
@@ -304,80 +333,44 @@ def _compare(values: dict[str, Any]) -> None:
     _run_study(spec, compare_command(env, arms, values, place["out"]), **place)
 
 
+def _plot(values: dict[str, Any]) -> None:
+    from sauna.experiments.report.curve import plot
+
+    print(f"figure: {plot([*map(Path, values['runs'])], values['out'], values['tag'])}")
+
+
 def _study(values: dict[str, Any]) -> None:
-    from sauna.experiments.study.command import load_spec, study_command
+    from sauna.experiments.study.command import check_study, load_spec, study_command
 
-    name = values.pop("study")
-    _run_study(load_spec(name), study_command(name, values["out"]), **values)
+    name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
+    spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
+    _run_study(spec, study_command(name, out), **values)
 
 
-def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
+def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:
     from sauna.experiments.study.command import lines, study
 
-    jobs = _whole({"processes": processes}, "processes", 0)
-    summary = study(spec, Path(out), command, jobs, on, address)
+    jobs = whole_number({"processes": processes}, "processes", 0)
+    summary = study(spec, Path(out), command, jobs, **place)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
     if not any(row["seeds"] for row in summary["table"]):
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
     if number := summary.get("not_measured"):
-        log = Path(out) / spec.name / spec.measure / "stderr.txt"
+        log = spec.measurement.folder(Path(out) / spec.name) / "stderr.txt"
         raise SaunaError(
             f"{number} members are not measured; what is said above, and {log}, say why"
         )
 
 
 def _bench(values: dict[str, Any]) -> None:
-    import json
+    from sauna.experiments.bench.flags import bench_from_flags
 
-    scale = values.pop("scale")
-    fixed = ("iterations", "seed", "seeds", "processes", "envs", "rollout_steps", "hidden")
-    unread = [name for name in fixed if name in values] + ["against"] * bool(values["against"])
-    if scale and unread:
-        raise BadInput(f"{unread[0]}: not read with --scale")
-    values.setdefault("iterations", "50")
-    rounds, iterations = _whole(values, "rounds", 1), _whole(values, "iterations", 2)
-    against, file = values.pop("against"), values.pop("json")
-    if file and not Path(file).resolve().parent.is_dir():
-        raise BadInput(f"json: {Path(file).parent} is not a folder")
-    script = values["script"]
-    if (against == "cleanrl") != bool(script) or (script and not Path(script).is_file()):
-        raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
-    for name in ("rounds", "iterations", "script"):
-        del values[name]
-    overrides = {"seeds": 6, **translate({"arm": "ppo", **values})}
-    from sauna.config.presets import plain, resolve_run
-    from sauna.experiments.bench.command import bench, bench_scale, report
-    from sauna.experiments.bench.device import bench_on_device, report_on_device, scale_on_device
-    from sauna.training.prepare import place
-
-    native = place(resolve_run(plain(overrides))).config.backend == "device"
-    if native and scale:
-        result = scale_on_device(overrides, rounds, iterations, _say)
-    elif native:
-        result = bench_on_device(
-            overrides, rounds=rounds, iterations=iterations, against=against, say=_say
-        )
-        print("\n".join(report_on_device(result)))
-    elif scale:
-        result = bench_scale(overrides, rounds, _say)
-    else:
-        result = bench(
-            overrides,
-            rounds=rounds,
-            iterations=iterations,
-            against=against,
-            script=Path(script) if script else None,
-            say=_say,
-        )
-        print("\n".join(report(result)))
-    if file:
-        Path(file).write_text(json.dumps(result, indent=1) + "\n")
-        print(f"figures: {file}")
+    bench_from_flags(values, _say)
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
+    print(printable(text), flush=True)
 
 
 def _list(values: dict[str, Any]) -> None:
@@ -429,6 +422,7 @@ _COMMANDS = {
     "eval": _eval,
     "inspect": _inspect,
     "compare": _compare,
+    "plot": _plot,
     "study": _study,
     "bench": _bench,
     "list": _list,

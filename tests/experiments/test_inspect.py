@@ -21,9 +21,9 @@ from helpers import SMALL, configured, own
 from sauna.algorithm.learner.samples import make_batch
 from sauna.algorithm.learner.vex_targets import make_target
 from sauna.algorithm.rollout.collected import capacity
-from sauna.algorithm.rollout.program import decide as decide_stretch
+from sauna.algorithm.rollout.program import decide as decide_segment
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.types import Hypers, Rollout
+from sauna.algorithm.types import Hypers, Rollout, ScoredStep
 from sauna.config.settings import Config
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -37,7 +37,7 @@ from sauna.experiments.inspect.inspection import (
     scaled,
 )
 from sauna.experiments.inspect.page import meaning
-from sauna.experiments.inspect.recording import MOST, SIDE, Pictures, Recorder, _played
+from sauna.experiments.inspect.recording import MAX_FRAMES, SIDE, Frames, Recorder, _played
 from sauna.system.errors import BadInput
 from worlds import Drawn, Lives, Scripted
 
@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def examined(run: Path, name: str = "sauna/0", **changes: Any) -> Inspection:
-    settings = {"episodes": 12, "deterministic": False, "seed": 3, "pictures": False, **changes}
+    settings = {"episodes": 12, "deterministic": False, "seed": 3, "frames": False, **changes}
     return examine(run, load_artifact(run), name, **settings, say=print)
 
 
@@ -103,8 +103,7 @@ def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) ->
         dropped=dropped,
     )
     vex = np.random.default_rng(0).normal(size=(70, envs)).astype(np.float32)
-    nothing = np.zeros((70, envs, 1), np.float32)
-    made = decide(config, nothing, vex, jax.random.key(0), hypers_of(config))
+    made = decide(config, scored(vex), jax.random.key(0), hypers_of(config))
     medians, keep, rollouts = by_hand(config, vex)
     assert made.keep.tolist() == keep and made.rollouts == rollouts and len(rollouts) > 1
     np.testing.assert_allclose(made.median, medians, rtol=1e-6)
@@ -112,6 +111,12 @@ def test_decisions_are_the_rule_written_out(history, decision, envs, dropped) ->
     np.testing.assert_array_equal(
         made.prediction, vex.mean(1) if decision == "joint" else vex[:, 0]
     )
+
+
+def scored(vex: np.ndarray) -> ScoredStep:
+    """Steps of which only the Vex prediction `[L, N]` is read."""
+    none = np.zeros(vex.shape, np.float32)
+    return ScoredStep(none[..., None], none[..., None], none, none, vex)
 
 
 def test_lost_lives_and_signs_are_what_is_learned() -> None:
@@ -136,26 +141,26 @@ def test_decisions_are_the_collectors(arm) -> None:
     more = {"drop_rate": 0.4} if arm == "random-drop" else {"threshold": THRESHOLD}
     config = configured(arm=arm, rollout_steps=64, minibatches=1, **more)
     vex = np.random.default_rng(1).normal(size=(40, 1)).astype(np.float32)
-    seen, key, hypers = np.zeros((40, 1, 1)), jax.random.key(7), hypers_of(config)
-    made = decide(config, seen, vex, key, hypers)
+    steps, key, hypers = scored(vex), jax.random.key(7), hypers_of(config)
+    made = decide(config, steps, key, hypers)
     filter, first = make_filter(config), jax.random.fold_in(key, 0)
     assert filter is not None
-    stretch = jax.jit(partial(decide_stretch, filter))
+    segment = jax.jit(partial(decide_segment, filter))
     state, rows = filter.init(1, capacity(config)), (np.int32(0), np.int32(40))
-    _, mask = stretch(state, seen, vex, *rows, first, hypers)
+    _, mask = segment(state, steps, *rows, first, hypers)
     assert made.keep.tolist() == np.asarray(mask)[:, 0].tolist() and 0 < made.keep.sum() < 40
 
 
 def test_without_a_filter_everything_is_kept() -> None:
     config = configured(arm="ppo", rollout_steps=16, minibatches=1)
-    made = decide(config, np.zeros((40, 1, 1)), np.ones((40, 1)), None, hypers_of(config))
+    made = decide(config, scored(np.ones((40, 1))), None, hypers_of(config))
     assert made.keep.all() and np.isnan(made.median).all() and made.rollouts == [0, 16, 32]
 
 
-def test_a_held_keep_rate_has_an_edge_that_moves() -> None:
+def test_a_target_keep_rate_has_an_edge_that_moves() -> None:
     config = configured(arm="sauna", keep_rate_target=0.6, rollout_steps=64, minibatches=1)
     vex = np.random.default_rng(4).normal(size=(90, 1)).astype(np.float32)
-    made = decide(config, np.zeros((90, 1, 1)), vex, jax.random.key(0), hypers_of(config))
+    made = decide(config, scored(vex), jax.random.key(0), hypers_of(config))
     assert abs(made.keep.mean() - 0.6) < 0.05
     known = ~np.isnan(made.edge)
     assert known.sum() > 80
@@ -169,7 +174,7 @@ def test_the_units_of_signs_are_signs(run, found) -> None:
         found.member.config, normalize_rewards=False, sign_rewards=True, dropped="mask"
     )
     changed = found._replace(member=found.member._replace(config=config))
-    told = meaning(changed)
+    told = "".join(meaning(changed))
     assert "in signs of rewards." in told and "raw units" not in told
     assert f"A rollout ends after {config.rollout_steps} env steps" in told
 
@@ -241,7 +246,7 @@ def test_advantages_over_kept_steps_are_the_updates() -> None:
     stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields))
     hypers = hypers_of(config)
     update = jax.jit(partial(make_batch, config=config, target=make_target(config)))
-    batch = update(stream, hypers)
+    batch = update(stream, hypers, jax.random.key(0))
     made = advantages(config, stream, [0], hypers)
     np.testing.assert_allclose(made[keep[:, 0]], batch.advantage, rtol=1e-5, atol=1e-6)
     assert np.isnan(made[~keep[:, 0]]).all()
@@ -272,26 +277,26 @@ def test_principal_components_of_many_pictures_are_those_of_some_pixels() -> Non
 def test_pictures_are_few_small_and_of_their_steps(run) -> None:
     from PIL import Image
 
-    drawn = examined(run, pictures=True).played.pictures
+    drawn = examined(run, frames=True).played.frames
     assert [row for row, _ in drawn] == [*range(len(drawn))]
-    pictures = [Image.open(io.BytesIO(data)) for _, data in drawn[:3]]
-    brightness = [np.asarray(picture.convert("L")).mean() for picture in pictures]
+    frames = [Image.open(io.BytesIO(data)) for _, data in drawn[:3]]
+    brightness = [np.asarray(picture.convert("L")).mean() for picture in frames]
     np.testing.assert_allclose(brightness, [0, 20, 40], atol=2)
 
     class Huge(Scripted):
         def render(self) -> np.ndarray:
             return np.zeros((400, 800, 3), np.uint8)
 
-    taken = Pictures(Huge(), print)
-    for row in range(3 * MOST):
+    taken = Frames(Huge(), print)
+    for row in range(3 * MAX_FRAMES):
         taken.take(row)
     rows = [row for row, _ in taken.taken]
-    assert MOST / 2 <= len(rows) <= MOST and np.unique(np.diff(rows)).tolist() == [4]
+    assert MAX_FRAMES / 2 <= len(rows) <= MAX_FRAMES and np.unique(np.diff(rows)).tolist() == [4]
     assert Image.open(io.BytesIO(taken.taken[0][1])).size == (SIDE, SIDE // 2)
     limited = Drawn("rgb_array")
     limited.reset(seed=0)
     limited.spec = SimpleNamespace(max_episode_steps=1000)  # type: ignore[assignment]
-    counted = Pictures(limited, print)
+    counted = Frames(limited, print)
     for row in range(1000):
         counted.take(row)
     assert [row for row, _ in counted.taken] == [*range(0, 1000, 4)]
@@ -309,9 +314,9 @@ def test_what_cannot_be_drawn_is_said_in_one_line(run, monkeypatch, how) -> None
     monkeypatch.setattr(Drawn, "__init__" if how == "cannot be made" else "render", broken)
     said: list[str] = []
     path = sauna.inspect(run, member="sauna/0", say=said.append)
-    assert len(said) == 1 and said[0].startswith("no pictures: ") and "\n" not in said[0]
+    assert len(said) == 1 and said[0].startswith("no frames: ") and "\n" not in said[0]
     text = path.read_text()
-    assert "There are no pictures." in text and "<img" not in text
+    assert "There are no frames." in text and "<img" not in text
 
 
 def test_bad_input_creates_nothing(run, tmp_path) -> None:
@@ -403,7 +408,7 @@ def test_the_page_needs_nothing_else(page) -> None:
 
 
 def test_without_a_head_the_page_says_so(run, browser, tmp_path) -> None:
-    path = sauna.inspect(run, member="ppo/0", out=tmp_path / "ppo.html", pictures=False)
+    path = sauna.inspect(run, member="ppo/0", out=tmp_path / "ppo.html", frames=False)
     assert "There is no Vex prediction: ppo trains no Vex head" in path.read_text()
     assert "vex" not in data_of(path)["series"]
     browser.open(path, width=1280)
@@ -435,7 +440,7 @@ def test_picture_line_and_numbers_are_of_one_step(browser, page, found) -> None:
     browser.run(MOVE % dropped)
     now = shown(browser)
     assert now["decision"] == "dropped" and now["row"] == str(dropped)
-    assert now["picture"].endswith(data["pictures"]["images"][dropped])
+    assert now["picture"].endswith(data["frames"]["images"][dropped])
     for name, values in data["series"].items():
         assert float(now[name]) == values[dropped]
     browser.run(MOVE % 0)

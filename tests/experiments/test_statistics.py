@@ -238,7 +238,7 @@ def test_false_findings_in_simulation(scores, n: int) -> None:
     kinds = [against(scores(random, n), scores(random, n)).kind for _ in range(trials)]
     wrong = (kinds.count("better") + kinds.count("worse")) / trials
     assert wrong <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / trials)
-    assert (kinds.count("too few") == trials) == (n == 3)
+    assert (kinds.count("underpowered") == trials) == (n == 3)
 
 
 def test_false_findings_among_several_arms_and_without_holm() -> None:
@@ -274,10 +274,10 @@ def test_verdicts() -> None:
     assert against(low, high).kind == "worse"
     assert against(low + 0.1, low).kind == "no evidence"
     few = against(high[:3], low[:3])
-    assert (few.kind, few.least, few.needed) == ("too few", 4, 6)
-    assert against(high[:0], low) == ("too few", (None, None, None), 1.0, 4, None)
+    assert (few.kind, few.least, few.needed) == ("underpowered", 4, 6)
+    assert against(high[:0], low) == ("underpowered", (None, None, None), 1.0, 4, None)
     assert against(high[:1], low).needed is None
-    assert against(high[:2], np.arange(8.0)).kind == "too few"  # by the interval
+    assert against(high[:2], np.arange(8.0)).kind == "underpowered"  # by the interval
     assert s.compare({}) == {}
 
 
@@ -289,7 +289,7 @@ def test_holm_can_undo_a_verdict_and_raise_the_least_number_of_seeds() -> None:
     np.testing.assert_allclose(both["x"].p, 2 * s.exact_p(x, y))
     parted = np.arange(4.0) + 10
     assert against(parted, np.arange(4.0)).kind == "better"
-    assert s.compare({name: (parted, np.arange(4.0)) for name in "xz"})["x"].kind == "too few"
+    assert s.compare({name: (parted, np.arange(4.0)) for name in "xz"})["x"].kind == "underpowered"
 
 
 def test_over_tasks_by_hand_and_never_narrower_than_the_bootstrap() -> None:

@@ -47,6 +47,7 @@ def serve(recorder: Recorder, inbox: Connection, outlet: Connection) -> None:
         reporter, iteration = PipeReporter(inbox, outbox, dies_alone=False), start
         while iteration < ITERATIONS and reporter.allowance(iteration):
             timing = {"seconds": 1.0, "collect_seconds": 0.5, "env_steps": 32}
+            timing |= {"collect_cpu_seconds": 0.5, "update_cpu_seconds": {}}
             reporter.iteration(iteration, [recorder.rows[iteration]], timing)
             iteration += 1
             if iteration % SAVED["checkpoint_every"] == 0:
@@ -120,7 +121,7 @@ def until(run: Path, hook: Hook, world: str = WORLD) -> BaseException | None:
     try:
         with watched(run, hook):
             go(run, world)
-    except (Crash, Exception) as error:
+    except (Crash, KeyboardInterrupt, Exception) as error:
         return error
     return None
 

@@ -208,8 +208,9 @@ MUTANTS = [
         ("starts with a whole sample", "1e-4)", "1.0)"),
         (
             "inactive rows count",
-            "number = weight.sum(-2)",
-            "number = weight.sum(-2) * 0 + weight.shape[-2]",
+            'nothing changes.\n    """\n    weight = active[..., None]\n    number = weight.sum(-2)',
+            'nothing changes.\n    """\n    weight = active[..., None]\n'
+            "    number = weight.sum(-2) * 0 + weight.shape[-2]",
         ),
         (
             "batch variance weighted by count",
@@ -507,9 +508,9 @@ MUTANTS = [
             "_mean(residual**2, weight)",
         ),
         (
-            "stretches not centred",
-            "over_stretch((return_ - over_stretch(return_)) ** 2)",
-            "over_stretch(return_**2)",
+            "segments not centred",
+            "over_segment((return_ - over_segment(return_)) ** 2)",
+            "over_segment(return_**2)",
         ),
         ("other clip", "CLIP_BELOW = -5.0", "CLIP_BELOW = -10.0"),
         ("rounding counts as variance", "ROUNDING = 1e-8", "ROUNDING = 0.0"),

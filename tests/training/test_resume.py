@@ -1,4 +1,4 @@
-"""A run interrupted anywhere and resumed ends with the bytes of a run left alone."""
+"""A run interrupted any_member and resumed ends with the bytes of a run left alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import sauna
 from faults.canned import trained_here
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna.config import presets
-from sauna.experiments.measure.streams import load_standing
+from sauna.experiments.measure.streams import load_snapshot
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
@@ -133,8 +133,8 @@ def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch) -> Non
     opened = runs.reopen(run, {}, make_display())
     opened.lock.close()
     assert {(m.config.learning_rate, m.config.gae_lambda) for m in opened.members} == {(3e-4, 0.95)}
-    standing = load_standing(run, opened.members[0].name, 2)
-    assert float(standing.hypers.gae_lambda) == np.float32(0.95)
+    snapshot = load_snapshot(run, opened.members[0].name, 2)
+    assert float(snapshot.hypers.gae_lambda) == np.float32(0.95)
     with trained_here():  # under the other presets
         sauna.resume(run, quiet=True)
     assert (run / "metrics.jsonl").read_bytes() == expected
@@ -195,8 +195,10 @@ def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None
     stored["config"]["gamma"] = 0.99
     stored["config"]["env"] = "worlds:Endless"
     path.write_text(json.dumps(stored))
-    with pytest.raises(BadInput, match="other spaces"):
+    with pytest.raises(BadInput, match=r"names code .* env 'worlds:Endless'"):
         sauna.resume(run, quiet=True)
+    with pytest.raises(BadInput, match="other spaces"):
+        sauna.resume(run, quiet=True, trust=True)
 
 
 def test_where_rows_were_lost_an_older_checkpoint_is_used(tmp_path, capsys) -> None:

@@ -201,7 +201,10 @@ class Config:
     )
 
     network: str = _network(
-        "auto", "trunk (auto: nature-cnn for images, else mlp)", choices=NETWORKS, plugin=True
+        "auto",
+        "trunk (auto: nature-cnn for images of 36 x 36 pixels or more, else mlp)",
+        choices=NETWORKS,
+        plugin=True,
     )
     hidden: tuple[int, ...] = _network(
         (64, 64), "widths of the MLP's hidden layers", at_least=1, read_when=readers.MLP
@@ -214,6 +217,12 @@ class Config:
     )
     log_std_init: float = _network(
         0.0, "first log standard deviation of continuous actions", needs_spaces=readers.CONTINUOUS
+    )
+    rescale_actions: bool = _normalisation(
+        True,
+        "stretch actions in [-1, 1] to the bounds of the action box (MuJoCo's tasks: no, as "
+        "published)",
+        needs_spaces=readers.CONTINUOUS,
     )
     normalize_observations: bool = _normalisation(
         True,

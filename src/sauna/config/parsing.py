@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import typing
+from collections.abc import Mapping
 from typing import Any
 
 from sauna.system.errors import BadInput
@@ -31,12 +32,15 @@ def read_value(name: str, value: Any, field_type: Any) -> Any:
     if typing.get_origin(field_type) is tuple:
         item = typing.get_args(field_type)[0]
         parts = value.split(",") if isinstance(value, str) else list(value)
+        if len(parts) > MAX_VALUES:
+            raise BadInput(f"{name}: {len(parts)} values are too many; at most {MAX_VALUES}")
         return tuple(str(part).strip() if item is str else _integer(part) for part in parts)
     if not isinstance(value, str):
         raise TypeError
     return value
 
 
+MAX_VALUES = 100  # of a list, such as the arms or the widths of layers
 _BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
@@ -66,6 +70,8 @@ def _seeds(value: Any) -> tuple[int, ...]:
                 f"seeds: {number} is too many; for the one seed {number} write --seed {number}"
             )
         return tuple(range(number))
+    if len(value) > MAX_SEEDS:
+        raise BadInput(f"seeds: {len(value)} are too many; at most {MAX_SEEDS}")
     return tuple(_integer(seed) for seed in value)
 
 
@@ -87,8 +93,33 @@ def _json_object(name: str, value: Any) -> str:
     if not isinstance(parsed, dict):
         raise ValueError
     try:
-        return json.dumps(parsed, sort_keys=True, allow_nan=False)
+        return json.dumps(parsed, sort_keys=True, allow_nan=False, default=_json_value)
     except ValueError:  # which no reader of JSON would take back
         raise BadInput(
             f"{name}: JSON has no infinity and no NaN; 1e300 is a bound that nothing reaches"
         ) from None
+
+
+def _json_value(value: Any) -> Any:
+    """A number or an array of numpy or JAX as JSON has it.
+
+    Raises:
+      BadInput: it is something else.
+    """
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise BadInput(
+        f"env_kwargs: a {type(value).__name__} is no JSON value; pass env as a function that "
+        "sets it, such as lambda: MyEnv(...)"
+    )
+
+
+def whole_number(values: Mapping[str, Any], name: str, least: int) -> int:
+    """The text of option `name` as a whole number of at least `least`.
+
+    Raises:
+      BadInput: it is something else.
+    """
+    if not values[name].isdigit() or int(values[name]) < least:
+        raise BadInput(f"{name}: must be a whole number of at least {least}")
+    return int(values[name])

@@ -7,6 +7,7 @@ A preset says how an algorithm trains; an arm says which transitions the update 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -70,6 +71,16 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 PRESETS["a2c-atari"] = {**PRESETS["a2c"], "sign_rewards": True, "normalize_rewards": False}
 PRESETS["a2c-mujoco"] = {**PRESETS["a2c"], "entropy_coef": 0.0, "trunk": "separate"}
+
+# Tasks with published results: MuJoCo's actions stay in the robot's own units, as there, if nobody
+# says otherwise (the other tasks here have boxes of [-1, 1], or no boxes).
+PUBLISHED = re.compile(
+    r"^(?:ALE|sauna|mjx|brax|playground)/|^gymnax/.*-MinAtar$|"
+    r"^(?:[\w.]+:)?(?:Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum|"
+    r"InvertedPendulum|Pusher|Reacher|Swimmer|Walker2d)-v\d+$"
+)
+# What was done before a field existed, if that is not its default.
+BEFORE = {"rescale_actions": False}
 
 # The preset of an algorithm where none is named.
 FIRST = {"ppo": "mujoco", "a2c": "a2c"}
@@ -333,7 +344,8 @@ def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
     """Layers defaults < preset < arm < what the user gives and the arm does not fix; unchecked."""
     preset = chosen_preset(parsed)
     free = {name: value for name, value in parsed.items() if name not in FIXED.get(arm, ())}
-    settings = {**PRESETS[preset], **arm_settings(arm), **free, "preset": preset}
+    of_env = {"rescale_actions": False} if PUBLISHED.match(parsed.get("env", "")) else {}
+    settings = {**of_env, **PRESETS[preset], **arm_settings(arm), **free, "preset": preset}
     return dataclasses.replace(Config(), **settings)
 
 

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from sauna.config.presets import RunConfig, parse_all
+from sauna.config.presets import BEFORE, RunConfig, parse_all
 from sauna.config.settings import Config, to_json
 from sauna.system.errors import BadInput
 from sauna.system.migrations import with_arms
@@ -44,10 +44,9 @@ def read_stored(stored: Mapping[str, Any]) -> RunConfig:
 def stored_config(stored: Mapping[str, Any]) -> Config:
     """Reads the config that `settings.to_json` wrote, perhaps before some fields existed.
 
-    A field that is missing has its default: whoever adds one sees to it that its default is what
-    was done before.
+    A field that is missing has its default, or what was done before it existed (`BEFORE`).
 
     Raises:
       BadInput: a key is unknown, or a value cannot be read.
     """
-    return Config(**parse_all(stored))
+    return Config(**parse_all({**BEFORE, **stored}))

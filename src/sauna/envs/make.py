@@ -7,24 +7,30 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from sauna.config.plugins import import_name
+from sauna.config.plugins import import_module, import_name, is_local
 from sauna.config.settings import NATIVE
+from sauna.envs.host.answers import close
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.envs.spaces import stretch
 from sauna.system.errors import BadInput, nearest, one_line
 
-_GYMNASIUM_ID = re.compile(r"^(?:[\w.-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
+_GYMNASIUM_ID = re.compile(r"^(?:[\w./-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
+_OLD_ATARI = re.compile(r"^(\w+?)(?:-ram)?(?:NoFrameskip|Deterministic)?-v\d$")
 
 
 def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
     """A function that makes the environment; it takes further keywords such as `render_mode`.
 
     `env` is a Gymnasium id (also `module:Id-v0`, importing the module first) or `module:function`.
+    A further keyword counts more than the same one among `env_kwargs`.
 
     Raises:
       BadInput: there is no such environment; the nearest known id is named.
     """
+    env = one_name(env)
     if is_native(env, env_kwargs):
         from sauna.envs.device.as_gymnasium import HostFace
         from sauna.envs.device.make import make_jax_env
@@ -34,18 +40,86 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
         from sauna.envs.host.atari_envs import AtariEnv, game_of
 
         game = game_of(env)
-        return lambda **more: AtariEnv(game, **env_kwargs, **more)
-    if ":" in env and not _GYMNASIUM_ID.match(env):
+        return lambda **more: AtariEnv(game, **{**env_kwargs, **more})
+    if is_function_name(env):
         function = import_name("env", env)
-        return lambda **more: function(**env_kwargs, **more)
+        check_makes(env, function)
+        return lambda **more: function(**{**env_kwargs, **more})
+    import gymnasium
+
+    name = _registered(env)
+    return lambda **more: gymnasium.make(
+        name, **{"disable_env_checker": True, **env_kwargs, **more}
+    )
+
+
+def one_name(env: str) -> str:
+    """The one name of an environment that has several.
+
+    Raises:
+      BadInput: it names an Atari game that would come without the preprocessing of the papers.
+    """
+    module, _, name = env.rpartition(":")
+    if module in ("ale_py", "gymnasium", "") and name.startswith("ALE/"):
+        return name
+    old = _OLD_ATARI.match(name)
+    if old and module in ("ale_py", "gymnasium", "") and not _is_another(name):
+        from sauna.envs.host.atari_envs import known_games
+
+        answer = f"ALE/{old[1]}-v5"
+        if answer in known_games():
+            raise BadInput(f"env: {env} lacks the published preprocessing; write {answer}")
+    return env
+
+
+def _is_another(name: str) -> bool:
+    """Whether a registered id is no Atari game."""
+    import gymnasium
+
+    spec = gymnasium.registry.get(name)
+    return spec is not None and not str(spec.entry_point).startswith("ale_py")
+
+
+def is_function_name(env: str) -> bool:
+    """Whether a name is `module:function`, and not `module:Id-v0`."""
+    return ":" in env and not _GYMNASIUM_ID.match(env)
+
+
+def check_makes(env: str, function: Any) -> None:
+    """Refuses what makes no environment: an environment itself, or no function at all.
+
+    Raises:
+      BadInput: saying what to write instead.
+    """
+    if is_jax_env(function) or isinstance(function, type):
+        return
+    if hasattr(function, "step") and hasattr(function, "reset"):
+        raise BadInput(
+            f"env: {_shown(env)} is an environment already; give what makes one: its class, or "
+            "lambda: MyEnv(...)"
+        )
+    if not callable(function):
+        raise BadInput(
+            f"env: {_shown(env)} is a {type(function).__name__}, and makes no environment; give a "
+            "Gymnasium id, a class, or a function"
+        )
+
+
+def _shown(env: str) -> str:
+    return "what was passed" if is_local(env) else env
+
+
+def _registered(env: str) -> str:
+    """Gymnasium's id of an environment, whose module is imported first.
+
+    Raises:
+      BadInput: there is no such id; the nearest is named.
+    """
     import gymnasium
 
     module, _, name = env.rpartition(":")
     if module:
-        try:
-            importlib.import_module(module)
-        except Exception as error:
-            raise BadInput(f"env: cannot import {module!r}: {one_line(error)}") from error
+        import_module("env", module, f"{module}:{name}")
     if name.startswith("sauna/"):
         tame_mujoco()
         importlib.import_module("sauna.envs.flagrun")
@@ -53,7 +127,16 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
     if "mujoco" in str(gymnasium.registry[name].entry_point):
         tame_mujoco()
-    return lambda **more: gymnasium.make(name, disable_env_checker=True, **env_kwargs, **more)
+    return name
+
+
+def known_in_this_process_alone(env: str) -> bool:
+    """Whether this program registered an id itself: another process would not find it."""
+    gymnasium = sys.modules.get("gymnasium")
+    if ":" in env or "/" in env or gymnasium is None or env not in gymnasium.registry:
+        return False
+    own = Path(gymnasium.envs.__file__).read_text(encoding="utf-8")  # registers them one by one
+    return f'"{env}"' not in own
 
 
 def tame_mujoco() -> None:
@@ -81,9 +164,14 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
     try:
         made = maker(**more)
     except Exception as error:  # whatever a user's environment raises when made
-        raise BadInput(f"env: {env} cannot be made: {one_line(error)}") from error
+        raise BadInput(f"env: {_shown(env)} cannot be made: {one_line(error)}") from error
+    if hasattr(made, "single_observation_space") or hasattr(made, "env_is_wrapped"):
+        raise BadInput(
+            f"env: {_shown(env)} gives a vector of environments; give what makes one of them, and "
+            "their number as envs (--envs)"
+        )
     if not hasattr(made, "observation_space"):
-        raise BadInput(f"env: {env} gives no environment, but {type(made).__name__}")
+        raise BadInput(f"env: {_shown(env)} gives no environment, but {type(made).__name__}")
     return made
 
 
@@ -104,7 +192,11 @@ def make_drawn_env(env: str, env_kwargs: dict[str, Any]) -> Any:
 
 
 def in_process_envs(
-    env: str, env_kwargs: dict[str, Any], seeds: Sequence[tuple[int, int]], backend: str
+    env: str,
+    env_kwargs: dict[str, Any],
+    seeds: Sequence[tuple[int, int]],
+    backend: str,
+    rescale: bool = False,
 ) -> GymnasiumEnvs:
     """M environments stepped in this process, by the fastest backend that gives the same bits.
 
@@ -112,7 +204,9 @@ def in_process_envs(
       env, env_kwargs: what is made; see `env_maker`.
       seeds: `(member seed, env index)` of each environment.
       backend: `auto`, or `gymnasium` to have every step taken by Gymnasium itself.
+      rescale: stretch actions in [-1, 1] to a bounded box.
     """
+    env = one_name(env)
     make = env_maker(env, env_kwargs)
     if backend == "auto" and env.startswith("ALE/"):
         from sauna.envs.host.atari_envs import AtariEnvs
@@ -122,11 +216,12 @@ def in_process_envs(
         from sauna.envs.host.mujoco_envs import MujocoEnvs, time_limit
 
         first = make()
-        fits = time_limit(first) is not None
-        first.close()
+        stretched = rescale and stretch(first.action_space) is not None
+        fits = time_limit(first) is not None and not stretched
+        close(first)
         if fits:
             return MujocoEnvs(make, seeds)
-    return GymnasiumEnvs(make, seeds)
+    return GymnasiumEnvs(make, seeds, rescale)
 
 
 def is_mujoco(env: str) -> bool:
@@ -145,9 +240,10 @@ def is_native(env: str, env_kwargs: dict[str, Any]) -> bool:
     """
     if env.split("/")[0] in NATIVE:
         return True
-    if ":" not in env or "-v" in env.rpartition(":")[2]:  # a Gymnasium id, `module:Id-v0`
+    if not is_function_name(env):
         return False
     thing = import_name("env", env)
+    check_makes(env, thing)
     if is_jax_env(thing) or not callable(thing):
         return is_jax_env(thing)
     try:
@@ -155,7 +251,7 @@ def is_native(env: str, env_kwargs: dict[str, Any]) -> bool:
     except Exception:
         return False
     if hasattr(made, "close"):
-        made.close()
+        close(made)
     return is_jax_env(made)
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.envs.host.answers import close, life_lost, one_number
 from sauna.envs.make import make_env
 from sauna.envs.spaces import Spaces, describe, observation_reader
 from sauna.system.errors import BadInput, one_line
@@ -39,8 +40,8 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     except Exception as error:  # whatever a user's environment raises when played
         raise BadInput(f"env: {env} cannot be played: {one_line(error)}") from error
     finally:
-        first.close()
-        second.close()
+        close(first)
+        close(second)
     return Probe(spaces, differs)
 
 
@@ -74,7 +75,7 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
     try:
         state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))
-        told = jax.eval_shape(one.step, state, action)
+        transition = jax.eval_shape(one.step, state, action)
     except Exception as error:  # whatever a user's environment raises when traced
         raise BadInput(f"env: {env} cannot be played: {one_line(error)}") from error
     once = {
@@ -84,9 +85,11 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
         "truncated": (),
     }
     for name, shape in once.items():
-        if getattr(told, name).shape != shape or (name == "observation" and first.shape != shape):
+        if getattr(transition, name).shape != shape or (
+            name == "observation" and first.shape != shape
+        ):
             raise BadInput(f"env: {env}: its {name} is not of shape {shape}")
-    if _arrays(told.state) != _arrays(state):
+    if _arrays(transition.state) != _arrays(state):
         raise BadInput(f"env: {env}: its state has other arrays after a step than after a reset")
 
 
@@ -114,8 +117,9 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
     env.action_space.seed(seed)
     seen = [(read(env.reset(seed=seed)[0]), 0.0, False)]
     for _ in range(STEPS):
-        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-        seen.append((read(observation), float(reward), bool(terminated or truncated)))
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        life_lost(info)  # raises where it cannot be read
+        seen.append((read(observation), one_number(reward), bool(terminated or truncated)))
         if seen[-1][2]:
             break
     return seen

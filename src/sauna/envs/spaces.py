@@ -11,6 +11,7 @@ import numpy as np
 from sauna.system.errors import BadInput
 
 SMALLEST_IMAGE = 36  # the Nature CNN's three convolutions need this many pixels
+MAX_BOUND = 1e30  # an action box this wide is not bounded: such bounds stand for none
 
 
 class Spaces(NamedTuple):
@@ -20,8 +21,10 @@ class Spaces(NamedTuple):
     observation_shape: tuple[int, ...]
     action_kind: str  # continuous | discrete | multi_discrete | multi_binary
     action_sizes: tuple[int, ...]  # (A,), (choices,), (choices, choices, ...), (bits,)
-    observation_text: str  # as Gymnasium prints them, to compare with a checkpoint's
-    action_text: str
+    # Of parts that are flattened, their order and sizes; runs of 0.1.0 hold Gymnasium's text.
+    observation_structure: Any
+    action_structure: Any
+    observation_high: float = 255.0  # of an image's bytes: the networks here divide by it
 
     @property
     def observation_dtype(self) -> Any:
@@ -39,9 +42,51 @@ class Spaces(NamedTuple):
 
 
 def read_spaces(values: list[Any]) -> Spaces:
-    """`Spaces` back from its JSON form, where tuples have become lists."""
-    fields: list[Any] = [tuple(v) if isinstance(v, list) else v for v in values]
-    return Spaces(*fields)
+    """`Spaces` back from its JSON form, where tuples have become lists.
+
+    Raises:
+      TypeError, ValueError: they are none.
+    """
+    spaces = Spaces(*map(_tuples, values))
+    for sizes in (spaces.observation_shape, spaces.action_sizes):
+        if not isinstance(sizes, tuple) or not all(
+            type(n) is int and 0 <= n < 2**31 for n in sizes
+        ):
+            raise ValueError(f"{sizes} are no sizes")
+    return spaces
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def difference(before: Spaces, now: Spaces) -> str:
+    """What of the spaces is not as it was, for a message; empty where a learner sees no difference.
+
+    Bounds and types of numbers are no part of it: the learner does not read them.
+    """
+    for name in Spaces._fields:
+        old, new = getattr(before, name), getattr(now, name)
+        if name.endswith("structure") and not (isinstance(old, tuple) and isinstance(new, tuple)):
+            continue  # text, of 0.1.0
+        if old != new:
+            return f"{name.replace('_', ' ')} {old} instead of {new}"
+    return ""
+
+
+def _structure(space: Any) -> tuple[Any, ...]:
+    """The kind of a space, and of its parts in the order in which they are flattened."""
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Dict):
+        return ("Dict", *((str(name), _structure(part)) for name, part in space.spaces.items()))
+    if isinstance(space, gym.Tuple):
+        return ("Tuple", *map(_structure, space.spaces))
+    if isinstance(space, gym.Discrete):
+        return ("Discrete", int(space.n))
+    if isinstance(space, gym.MultiDiscrete):
+        return ("MultiDiscrete", *map(int, space.nvec.ravel()))
+    return (type(space).__name__, *map(int, space.shape or ()))
 
 
 def describe(observation_space: Any, action_space: Any) -> Spaces:
@@ -51,33 +96,72 @@ def describe(observation_space: Any, action_space: Any) -> Spaces:
       BadInput: a space that is not supported, by name.
     """
     kind, shape = describe_observation(observation_space)
+    high = float(observation_space.high.max(initial=0)) if kind == "image" else 0.0
     action_kind, sizes = _describe_action(action_space)
-    return Spaces(kind, shape, action_kind, sizes, str(observation_space), str(action_space))
+    parts = _structure(observation_space), _structure(action_space)
+    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0)
 
 
 def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
+    """The kind of an observation and the shape of its array.
+
+    Raises:
+      BadInput: the space, or a part of it, cannot be learned from; its key is named.
+    """
     from gymnasium import spaces as gym
 
-    if isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3):
-        shape = _channels_last(space.shape)
-        if min(shape[:2]) < SMALLEST_IMAGE:
-            raise BadInput(
-                f"observation space {space} is not supported: images need at least "
-                f"{SMALLEST_IMAGE} x {SMALLEST_IMAGE} pixels"
-            )
-        return "image", shape
-    if isinstance(space, gym.Box):
-        return "vector", (math.prod(space.shape),)
-    if isinstance(space, gym.Discrete):
-        return "one_hot", (int(space.n),)
-    if isinstance(space, gym.Dict) and all(
-        isinstance(part, gym.Box | gym.Discrete) for part in space.spaces.values()
-    ):
-        return "vector", (gym.utils.flatdim(space),)
-    raise BadInput(
-        f"observation space {type(space).__name__} is not supported "
-        "(Box, Discrete, and Dict of those are)"
-    )
+    if _is_bytes(space):
+        return "image", _channels_last(space.shape)
+    _check_part(space, "")
+    size = int(gym.utils.flatdim(space))
+    if isinstance(space, gym.Discrete | gym.MultiDiscrete | gym.MultiBinary):
+        return "one_hot", (size,)
+    return "vector", (size,)
+
+
+def _is_bytes(space: Any) -> bool:
+    """Whether a space is a picture or a board: `uint8`, of two or three axes."""
+    from gymnasium import spaces as gym
+
+    return isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3)
+
+
+def _check_part(space: Any, key: str) -> None:
+    """Refuses what cannot be read as a short vector, and says what to do instead.
+
+    Args:
+      key: of the part in its Dict or Tuple, `["camera"]`; empty for the whole space.
+    """
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Dict | gym.Tuple):
+        parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
+        for name, part in parts:
+            _check_part(part, f"{key}[{name!r}]")
+        return
+    if not isinstance(space, gym.Box | gym.Discrete | gym.MultiDiscrete | gym.MultiBinary):
+        raise BadInput(
+            f"observation space{key}: {type(space).__name__} is not supported (Box, Discrete, "
+            "MultiDiscrete, MultiBinary, and Dict and Tuple of those are)"
+        )
+    if sum(side >= SMALLEST_IMAGE for side in space.shape or ()) >= 2:
+        raise BadInput(
+            f"observation space{key}: pictures of shape {space.shape} and type {space.dtype} are "
+            f"not supported {_instead(space, key)}"
+        )
+
+
+def _instead(space: Any, key: str) -> str:
+    """What to write where a picture cannot be taken as it is."""
+    flat = "gymnasium.wrappers.FlattenObservation makes one vector of it for an MLP"
+    if key:
+        return (
+            "in a Dict or Tuple: give the picture alone (uint8 [H, W, C]), "
+            "or leave it out (gymnasium.wrappers.FilterObservation)"
+        )
+    if len(space.shape) > 3:
+        return f"(more than three axes): give a stack as uint8 [H, W, frames x C]; {flat}"
+    return f"(only uint8 is): give bytes up to 255 as uint8 [H, W, C]; {flat}"
 
 
 def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
@@ -92,7 +176,7 @@ def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
     if isinstance(space, gym.MultiBinary) and len(space.shape) == 1:
         return "multi_binary", (int(space.shape[0]),)
     raise BadInput(
-        f"action space {space} is not supported "
+        f"action space {' '.join(str(space).split())} is not supported "
         "(continuous Box, Discrete, MultiDiscrete and MultiBinary are)"
     )
 
@@ -115,7 +199,7 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     """
     from gymnasium import spaces as gym
 
-    if isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3):
+    if _is_bytes(space):
         if len(space.shape) == 2:
             return lambda image: image[..., None]
         if _channels_first(space.shape):
@@ -126,21 +210,16 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     return lambda x: gym.flatten(space, x)
 
 
-def action_writer(space: Any) -> Callable[[np.ndarray], Any]:
-    """A function from an action `[A]` to what `env.step` takes; only here is an action clipped."""
+def action_writer(space: Any, rescale: bool = False) -> Callable[[np.ndarray], Any]:
+    """A function from an action `[A]` to what `env.step` takes; only here is an action clipped.
+
+    Args:
+      rescale: stretch [-1, 1] to the bounds of a box, where it has both; else only clip.
+    """
     from gymnasium import spaces as gym
 
     if isinstance(space, gym.Box):
-        low, high, shape, dtype = space.low.ravel(), space.high.ravel(), space.shape, space.dtype
-        lowest, highest = low.astype(np.float32), high.astype(np.float32)
-
-        def clip(action: np.ndarray) -> np.ndarray:
-            inside = np.minimum(np.maximum(action, lowest), highest)
-            return inside if inside.dtype == dtype else inside.astype(dtype)
-
-        if len(shape) == 1:
-            return clip
-        return lambda action: clip(action).reshape(shape)
+        return _box_writer(space, rescale)
     if isinstance(space, gym.Discrete):
         start = int(space.start)
         return lambda action: int(action[0]) + start
@@ -148,3 +227,39 @@ def action_writer(space: Any) -> Callable[[np.ndarray], Any]:
         starts = np.asarray(getattr(space, "start", 0))
         return lambda action: (action + starts).astype(space.dtype)
     return lambda action: action.astype(space.dtype)
+
+
+def _box_writer(space: Any, rescale: bool) -> Callable[[np.ndarray], Any]:
+    low, high, shape, dtype = space.low.ravel(), space.high.ravel(), space.shape, space.dtype
+    lowest, highest = low.astype(np.float32), high.astype(np.float32)
+    stretched = stretch(space) if rescale else None
+
+    def clip(action: np.ndarray) -> np.ndarray:
+        inside = np.minimum(np.maximum(action, lowest), highest)
+        return inside if inside.dtype == dtype else inside.astype(dtype)
+
+    def write(action: np.ndarray) -> np.ndarray:
+        assert stretched is not None
+        bounded, center, half = stretched
+        inner = np.where(bounded, np.clip(action, -1.0, 1.0), action)
+        return np.clip((center + half * inner).astype(dtype), low, high)
+
+    chosen = clip if stretched is None else write
+    return chosen if len(shape) == 1 else lambda action: chosen(action).reshape(shape)
+
+
+def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """How [-1, 1] is stretched to a box: `center + half * action` where `bounded`, all `[A]`.
+
+    Components without both bounds have center 0 and half 1: they stay as they are.
+
+    Returns:
+      `(bounded, center, half)`, or None where nothing would change.
+    """
+    low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+    bounded = (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    center, half = (low + high) / 2, (high - low) / 2
+    if np.all(center == 0.0) and np.all(half == 1.0):
+        return None
+    return bounded, center, half

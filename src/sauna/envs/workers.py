@@ -13,8 +13,9 @@ from sauna.envs.host.contract import HostEnvs, Snapshot, Step
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import read_spaces
-from sauna.system.errors import SaunaError
+from sauna.system.errors import SaunaError, one_line
 from sauna.system.processes import Message, child_ends, receive, send, start_worker
+from sauna.system.tracebacks import cause_of, describe_failure
 
 STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
 NOTICE = 0.2  # seconds after which the end of a worker is noticed while another one is awaited
@@ -29,7 +30,7 @@ class ProcessEnvs(HostEnvs):
       seeds: `(member seed, env index)` of each environment.
       processes: number of workers.
       timeout: seconds after which a silent worker counts as hung.
-      backend: of each worker; see `in_process_envs`.
+      backend, rescale: of each worker; see `in_process_envs`.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class ProcessEnvs(HostEnvs):
         processes: int,
         timeout: float,
         backend: str = "auto",
+        rescale: bool = False,
     ) -> None:
         self._timeout = timeout
         self._parts = np.array_split(np.arange(len(seeds)), processes)
@@ -55,6 +57,7 @@ class ProcessEnvs(HostEnvs):
                         "kwargs": env_kwargs,
                         "seeds": chosen,
                         "backend": backend,
+                        "rescale": rescale,
                     }
                 )
             except BrokenPipeError:
@@ -122,7 +125,8 @@ class ProcessEnvs(HostEnvs):
             code = worker.process.wait()
             raise EnvironmentFailure(f"{name} ended with exit code {code}") from None
         if message.header["kind"] == "failure":
-            raise EnvironmentFailure(f"{name}: {message.header['message']}")
+            error = EnvironmentFailure(f"{name}: {message.header['message']}")
+            raise error from cause_of(message.header)
         return message
 
     def _wait_for(self, number: int, timeout: float) -> bool:
@@ -156,14 +160,16 @@ def main() -> None:
     try:
         header = receive(inbox).header
         seeds = [(int(a), int(b)) for a, b in header["seeds"]]
-        envs = in_process_envs(header["env"], header["kwargs"], seeds, header["backend"])
+        how = header["backend"], header["rescale"]
+        envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
         while True:
             send(outbox, {"kind": "answer"}, _serve(envs, receive(inbox)))
     except (EOFError, BrokenPipeError):
         return
-    except SaunaError as error:
-        send(outbox, {"kind": "failure", "message": str(error)})
+    except Exception as error:
+        text = str(error) if isinstance(error, SaunaError) else one_line(error)
+        send(outbox, {"kind": "failure", "message": text, **describe_failure(error, False)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Learning curves as numbers: their area, and a grid that all of them have."""
+"""Learning curves as numbers: their AUC, and a grid that all of them have."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def area_under_curve(env_steps: np.ndarray, values: np.ndarray) -> float | None:
-    """Trapezoids under a curve over env steps, divided by their range: a mean over training.
+    """Computes the area under a curve over env steps by trapezoids, divided by their range (AUC).
 
     It runs from the first finite value to the last one; what came before the first finished
     episode is unknown and does not count as 0. Gaps between are bridged by straight lines.
@@ -29,7 +29,7 @@ def area_under_curve(env_steps: np.ndarray, values: np.ndarray) -> float | None:
 
 
 def common_grid(env_steps: Sequence[np.ndarray], most: int) -> np.ndarray:
-    """Env steps `[X]`, at most `most`, that lie within every member's curve.
+    """Returns env steps `[X]`, at most `most`, that lie within every member's curve.
 
     Where all members were measured at the same steps it is those, and nothing is interpolated.
     """
@@ -45,7 +45,8 @@ def common_grid(env_steps: Sequence[np.ndarray], most: int) -> np.ndarray:
 
 
 def on_grid(env_steps: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """A curve at the points of `grid`, linear between finite values and NaN outside them."""
+    """Returns a curve at the points of `grid`, linear between finite values and NaN outside
+    them."""
     known = np.isfinite(values)
     if not known.any():
         return np.full(len(grid), np.nan)

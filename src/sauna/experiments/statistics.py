@@ -46,9 +46,9 @@ class Estimate(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What the scores of an arm say against those of the baseline; see `compare`."""
+    """What the scores of an arm say beside those of the baseline; see `compare`."""
 
-    kind: str  # better, worse, no evidence, too few
+    kind: str  # better, worse, no evidence, underpowered
     improvement: Estimate  # P(arm > baseline)
     p: float  # of the exact test, after Holm's correction
     least: int  # seeds of each below which nothing can be found
@@ -56,7 +56,7 @@ class Comparison(NamedTuple):
 
 
 def iqm(scores: np.ndarray) -> np.ndarray:
-    """Interquartile mean over the last axis of `[..., n]` (Agarwal et al. 2021).
+    """Computes the interquartile mean over the last axis of `[..., n]` (Agarwal et al. 2021).
 
     The lowest and highest `floor(n / 4)` are left out, so with fewer than four scores it is the
     plain mean. Tasks may be pooled only where their scores share a scale.
@@ -65,7 +65,7 @@ def iqm(scores: np.ndarray) -> np.ndarray:
 
 
 def iqm_estimate(strata: Sequence[np.ndarray]) -> Estimate:
-    """IQM of the pooled scores, with a stratified bootstrap interval.
+    """Computes the IQM of the pooled scores, with a stratified bootstrap interval.
 
     Seeds are drawn with replacement within each task, so that every resample holds all tasks.
     Percentile intervals as in rliable. BCa was measured and covers no better at 3 to 10 seeds.
@@ -90,7 +90,7 @@ def iqm_estimate(strata: Sequence[np.ndarray]) -> Estimate:
 def performance_profile(
     scores: np.ndarray, thresholds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share of runs with `score >= threshold`, and the ends of its bootstrap band.
+    """Computes the share of runs with `score >= threshold`, and the ends of its bootstrap band.
 
     The number of resampled runs above a threshold is binomial, so the band is computed rather than
     drawn. It holds pointwise and shrinks to nothing where all runs or none reach the threshold,
@@ -107,17 +107,17 @@ def performance_profile(
 
 
 def wins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """`[n, m]`: 1 where `x_i > y_j`, 1/2 where they are equal, else 0."""
+    """Returns `[n, m]`: 1 where `x_i > y_j`, 1/2 where they are equal, else 0."""
     return (x[:, None] > y) + 0.5 * (x[:, None] == y)
 
 
 def improvement(x: np.ndarray, y: np.ndarray) -> float:
-    """P(X > Y) + P(X = Y) / 2, estimated as Mann and Whitney's `U / (n m)`."""
+    """Estimates P(X > Y) + P(X = Y) / 2 by Mann and Whitney's `U / (n m)`."""
     return float(wins(x, y).mean())
 
 
 def improvement_estimate(x: np.ndarray, y: np.ndarray) -> Estimate:
-    """P(X > Y) on one task, with an interval that agrees with the Mann-Whitney test.
+    """Estimates P(X > Y) on one task, with an interval that agrees with the Mann-Whitney test.
 
     The ends are the values `t` that lie `z sd(t) + 1 / (2 n m)` from the estimate, where
     `sd(t)^2 = t (1 - t) (1 + k (1 - t) / (2 - t) + k t / (1 + t)) / (n m)`, `k = (n + m) / 2 - 1`
@@ -153,7 +153,8 @@ def _lower_end(value: float, n: int, m: int) -> float:
 
 
 def bootstrap_improvement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
-    """Stratified bootstrap interval of P(X > Y) averaged over tasks, as rliable computes it.
+    """Computes the stratified bootstrap interval of P(X > Y) averaged over tasks, as rliable
+    computes it.
 
     Each arm's seeds are redrawn within each task. `counts` says how often each was drawn, which
     makes a resampled U one matrix product.
@@ -173,7 +174,7 @@ def bootstrap_improvement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> tup
 
 
 def improvement_over_tasks(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Estimate:
-    """P(X > Y) averaged over tasks, each end of the interval the wider of two.
+    """Estimates P(X > Y) averaged over tasks, each end of the interval the wider of two.
 
     The bootstrap is too narrow with few seeds and tasks, and calls it certain where every run of
     one arm wins. The other interval adds up those of the tasks (Zou and Donner 2008),
@@ -192,7 +193,7 @@ def improvement_over_tasks(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Es
 
 
 def exact_p(x: np.ndarray, y: np.ndarray) -> float:
-    """Two-sided p value of the Mann-Whitney test, exact with ties as without.
+    """Computes the two-sided p value of the Mann-Whitney test, exact with ties as without.
 
     The chance, over all ways to deal the pooled ranks out to the two arms, of a rank sum at least
     as far from its mean as the one seen. It supposes equal distributions, not merely
@@ -225,8 +226,8 @@ def _rank_sum_chances(twice_ranks: tuple[int, ...], n: int) -> np.ndarray:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction: rejecting below `ALPHA`, any false rejection has at most that
-    chance, whatever the number of tests."""
+    """Applies Holm's step-down correction: rejecting below `ALPHA`, any false rejection has at most
+    that chance, whatever the number of tests."""
     p = np.asarray(p_values, float)
     order = np.argsort(p, kind="stable")
     corrected = np.empty_like(p)
@@ -235,13 +236,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def least_seeds(comparisons: int) -> int:
-    """Seeds of each arm from which `comparisons` tests can reject at all: `2 / C(2n, n)` is the
-    smallest two-sided p value of `n` against `n`."""
+    """Returns the seeds of each arm from which `comparisons` tests can reject at all.
+
+    `2 / C(2n, n)` is the smallest two-sided p value of `n` against `n`.
+    """
     return next(n for n in itertools.count(2) if comparisons * 2 / math.comb(2 * n, n) < ALPHA)
 
 
 def seeds_needed(chance: float, comparisons: int = 1, power: float = POWER) -> int | None:
-    """Seeds of each arm for the test to find a true P(X > Y) of `chance` with the given power.
+    """Computes the seeds of each arm with which the test finds a true P(X > Y) of `chance`.
 
     `n = (z_{1 - alpha/2} + z_power)^2 / (6 (chance - 1/2)^2)` (Noether 1987, equal groups), with
     alpha split over the comparisons. A normal approximation, rough below ten seeds; and an
@@ -257,8 +260,10 @@ def seeds_needed(chance: float, comparisons: int = 1, power: float = POWER) -> i
 
 
 def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Comparison]:
-    """Two arms' scores against each other, for each of a family of questions: other arms on one
-    task, or one arm on other tasks.
+    """Compares the scores of two arms, for each of a family of questions.
+
+    A family is other arms on one task, or one arm on other tasks. A score of -inf is the worst
+    outcome, as of a failed seed.
 
     `better` and `worse` need both: the exact test below `ALPHA` after Holm's correction over the
     family, and an interval that leaves 1/2 out. Where both have equal distributions, of whatever
@@ -266,8 +271,8 @@ def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Com
     wrong a little more often: in 6% to 8% of trials with 6 to 30 seeds of each and a spread five
     times the other, in 11% to 13% where the arm of lesser spread also has twice the seeds.
 
-    `too few` is where not even perfectly parted scores would pass. `needed` is None where a single
-    seed, or no difference, is all there is.
+    `underpowered`: not even perfectly parted scores would pass. `needed` is None if a single seed,
+    or no difference, is all there is.
 
     Args:
       pairs: name -> the scores of an arm `[n]` and of its baseline `[m]`, possibly empty.
@@ -283,11 +288,11 @@ def compare(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Com
 def _comparison(x: np.ndarray, y: np.ndarray, p: float, lowest_p: float, family: int) -> Comparison:
     n, m = len(x), len(y)
     if min(n, m) == 0:
-        return Comparison("too few", Estimate(None, None, None), p, least_seeds(family), None)
+        return Comparison("underpowered", Estimate(None, None, None), p, least_seeds(family), None)
     estimate = improvement_estimate(x, y)
     needed = None if estimate.low is None else seeds_needed(improvement(x, y), family)
     reachable = lowest_p < ALPHA and _lower_end(1.0, n, m) > 0.5
-    kind = _kind(estimate, p) if reachable else "too few"
+    kind = _kind(estimate, p) if reachable else "underpowered"
     return Comparison(kind, estimate, p, least_seeds(family), needed)
 
 
@@ -300,7 +305,7 @@ def _kind(estimate: Estimate, p: float) -> str:
 
 
 def mean_interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over members of `[P, X]` and its interval at each point, by Student's t.
+    """Computes the mean over members of `[P, X]` and its interval at each point, by Student's t.
 
     A bootstrap of 3 to 6 members is too narrow even for normal values, where t is right. Nothing
     helps where few runs stand far above the rest, as the members seen may hold none of them: with

@@ -14,8 +14,11 @@ class BadInput(SaunaError):
     """The user asked for something that cannot be done (exit code 2, nothing created)."""
 
 
-class Interrupted(SaunaError):
-    """A signal stopped the run after its state was saved (exit code 128 + signal)."""
+class Interrupted(KeyboardInterrupt):
+    """A signal stopped the run after its state was saved (exit code 128 + signal).
+
+    It is no `Exception`: a loop over runs that goes on after one failed stops here.
+    """
 
     def __init__(self, signal_number: int, message: str) -> None:
         super().__init__(message)
@@ -31,3 +34,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def one_line(error: BaseException) -> str:
     """Type and message of somebody else's exception, in one line of bounded length."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+
+
+def printable(text: str) -> str:
+    """A text in one line, without characters that a terminal would act on."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

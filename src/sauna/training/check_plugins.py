@@ -1,4 +1,4 @@
-"""A user's parts, traced once: what they give is what training will scan over."""
+"""A user's parts, traced once: they give what training expects of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.learner.vex_targets import make_target
+from sauna.algorithm.policy.policy import check_collections, make_trunk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import Hypers, ScoredStep, StepFilter
@@ -19,11 +20,13 @@ from sauna.training.check_selection import check_selection, may_become
 
 
 def check_plugins(config: Config, spaces: Spaces) -> None:
-    """Builds the program and traces filter and target, which compiles and computes nothing.
+    """Builds the program and traces its parts; a network is also tried on random observations.
 
     Raises:
       BadInput: a part cannot be used, or gives another shape or type than training needs.
     """
+    if ":" in config.network:
+        _check_network(config, spaces)
     try:
         program = make_program(config, spaces)
         if program.filter is not None:
@@ -34,6 +37,69 @@ def check_plugins(config: Config, spaces: Spaces) -> None:
         raise
     except Exception as error:  # a user's part fails in its own way
         raise BadInput(f"a part of your own cannot be used: {one_line(error)}") from error
+
+
+def _check_network(config: Config, spaces: Spaces) -> None:
+    """Traces a user's trunk, alone, and tries it and its gradient on random observations.
+
+    Training calls it with one axis in front of an observation, and with two.
+    """
+    field = f"network: {config.network}"
+    module, key = make_trunk(config, spaces)("trunk", None), jax.random.key(0)
+    try:
+        for lead in ((2,), (3, 2)):
+            shape = (*lead, *spaces.observation_shape)
+            seen = jax.ShapeDtypeStruct(shape, spaces.observation_dtype)
+            variables = jax.eval_shape(module.init, key, seen)
+            check_collections(config, variables)
+            given = jax.eval_shape(module.apply, variables, seen)
+            if len(getattr(given, "shape", ())) != len(lead) + 1 or given.shape[:-1] != lead:
+                wanted = (*lead, "features")
+                raise BadInput(
+                    f"{field} gives {_shape(given)} for observations of shape {shape}, instead of "
+                    f"({', '.join(map(str, wanted))})"
+                )
+            if not jnp.issubdtype(given.dtype, jnp.floating):
+                raise BadInput(f"{field} gives {given.dtype}, instead of floating-point features")
+        _check_finite(field, module, key, spaces)
+    except BadInput:
+        raise
+    except Exception as error:  # a user's module fails in its own way
+        observations = f"on observations of shape {(2, *spaces.observation_shape)}"
+        hint = "; Dropout needs deterministic=True" * ("PRNG" in str(error) or _is_dropout(error))
+        raise BadInput(
+            f"{field} cannot be used {observations}: {one_line(error)[:160]}{hint}"
+        ) from error
+
+
+def _is_dropout(error: Exception) -> bool:
+    return "deterministic" in str(error)
+
+
+def _check_finite(field: str, module: Any, key: Any, spaces: Spaces) -> None:
+    """Refuses a network that gives NaN or infinity, or whose gradient does."""
+    shape = (8, *spaces.observation_shape)
+    if spaces.observation_kind == "image":
+        most = int(spaces.observation_high) + 1
+        seen = jax.random.randint(key, shape, 0, most).astype(jnp.uint8)
+    elif spaces.observation_kind == "one_hot":
+        seen = jax.random.bernoulli(key, 0.5, shape).astype(jnp.float32)
+    else:
+        seen = jax.random.normal(key, shape)
+    variables = module.init(key, seen)
+
+    def total(variables: Any) -> Any:
+        features = module.apply(variables, seen)
+        return features.sum(), features
+
+    gradient, features = jax.grad(total, has_aux=True)(variables)
+    for what, arrays in (("features", features), ("a gradient", gradient)):
+        for array in jax.tree.leaves(arrays):
+            if not bool(jnp.isfinite(array).all()):
+                raise BadInput(
+                    f"{field} gives {what} of shape {array.shape} with NaN or infinity, for "
+                    f"observations of shape {shape}"
+                )
 
 
 def _check_target(config: Config) -> None:

@@ -44,8 +44,7 @@ def _trace(config: Config, spaces: Spaces, sampler: Sampler) -> tuple[Any, Any, 
     """The sampler's state before and after a choice, and the choice, as shapes."""
     rows = config.rollout_steps * config.envs
     number: Any = jax.ShapeDtypeStruct((rows,), jnp.float32)
-    kind = jnp.uint8 if spaces.observation_kind == "image" else jnp.float32
-    seen: Any = jax.ShapeDtypeStruct((rows, *spaces.observation_shape), kind)
+    seen: Any = jax.ShapeDtypeStruct((rows, *spaces.observation_shape), spaces.observation_dtype)
     width = jnp.float32 if spaces.action_kind == "continuous" else jnp.int32
     action: Any = jax.ShapeDtypeStruct((rows, spaces.action_width), width)
     present: Any = jax.ShapeDtypeStruct((rows,), bool)

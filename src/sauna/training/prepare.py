@@ -14,7 +14,7 @@ from sauna.config.presets import Member, RunConfig, arm_settings, parse_all, res
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
-from sauna.envs.spaces import Spaces
+from sauna.envs.spaces import SMALLEST_IMAGE, Spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
@@ -196,13 +196,15 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
     """
     config = run.config
     image = spaces.observation_kind == "image"
+    large = image and min(spaces.observation_shape[:2]) >= SMALLEST_IMAGE
     network = config.network
     if network == "auto":
-        network = "nature-cnn" if image else "mlp"
-    if (network == "nature-cnn") != image and ":" not in network:
+        network = "nature-cnn" if large else "mlp"
+    if network == "nature-cnn" and not large:
+        least = f" (it needs {SMALLEST_IMAGE} x {SMALLEST_IMAGE} pixels)" * image
         raise BadInput(
             f"network: {network} does not fit {spaces.observation_kind} observations of shape "
-            f"{spaces.observation_shape}"
+            f"{spaces.observation_shape}{least}"
         )
     number = len(run.members)
     processes = config.processes or os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""The threshold as a dial: coverage where it is known, verdicts, and a study from its file."""
+"""The threshold sweep: coverage where it is known, verdicts, and a study from its file."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from helpers import environment
 from sauna.experiments.measure.coverage import particle_entropy
 from sauna.experiments.measure.coverage_report import (
     correlation,
-    extra,
     marks,
+    report,
     text_table,
     verdicts,
 )
-from sauna.experiments.study.measuring import ALONG, Item, gather_measured, items_of, scale_of
+from sauna.experiments.measure.measurement import ALONG
+from sauna.experiments.study.measuring import Item, gather_measured, items_of, scale_of
 from sauna.experiments.study.results import gather
 from sauna.experiments.study.spec import load_spec, read_spec
 from sauna.experiments.study.units import units_of
@@ -65,35 +66,35 @@ def study(*cells: dict[str, Any]) -> dict[str, Any]:
 RISING = [cell(str(t), [t, t + 0.1, t - 0.1], threshold=t) for t in (0.0, 0.5, 1.0)]
 
 
-def test_a_dial_is_found_where_there_is_one_and_only_there() -> None:
+def test_a_trade_is_found_where_there_is_one_and_only_there() -> None:
     assert "moves exploration against return" in verdicts(study(*RISING))[0]
     assert "entropy rises (rank correlation 0.9" in verdicts(study(*RISING))[0]
     random = np.random.default_rng(0)
     found = 0
     for _ in range(20):
         flat = [cell(str(t), random.normal(size=4).tolist(), threshold=t) for t in (0, 0.5, 1)]
-        found += "no evidence that the threshold is a dial" not in verdicts(study(*flat))[0]
+        found += "no evidence that the threshold moves exploration" not in verdicts(study(*flat))[0]
     assert found <= 2
     assert "no answer yet" in verdicts(study(*RISING[:2]))[0]
 
 
-def test_an_arm_is_told_apart_from_its_coin_pair_by_pair() -> None:
-    """Entropy and coverage of the coins lie 0.2 below, seed by seed; or not at all."""
+def test_an_arm_is_compared_with_its_random_control_pair_by_pair() -> None:
+    """Entropy and coverage of the controls lie 0.2 below, seed by seed; or not at all."""
     for gaps, said in (
         (
             [0.2, 0.2, 0.2],
-            "told apart by entropy and coverage and return (threshold minus coin: "
+            "differ in entropy and coverage and return (threshold minus control: "
             "entropy 0.20 [0.20, 0.20], coverage 0.20 [0.20, 0.20], return -0.20 [-0.20, -0.20]; "
             "3 pairs).",
         ),
-        ([0.2, -0.3, 0.1], "are not told apart (threshold minus coin: entropy 0.0"),
+        ([0.2, -0.3, 0.1], "show no difference (threshold minus control: entropy 0.0"),
     ):
         values = [x - gap for x, gap in zip([0.5, 0.6, 0.4], gaps, strict=True)]
-        coin = cell("coin", values, arm="random-drop", rates_of="0.5")
-        told = verdicts(study(*RISING, coin))
-        assert len(told) == 2 and said in told[1], told[1]
-        assert told[1].startswith("A-v0: threshold 0.5 and a coin that drops as much are ")
-    few = cell("coin", [0.1], arm="random-drop", rates_of="0.5")
+        control = cell("control", values, arm="random-drop", rates_of="0.5")
+        found = verdicts(study(*RISING, control))
+        assert len(found) == 2 and said in found[1], found[1]
+        assert found[1].startswith("A-v0: threshold 0.5 and its matched random control ")
+    few = cell("control", [0.1], arm="random-drop", rates_of="0.5")
     assert "have too few pairs yet" in verdicts(study(*RISING, few))[1]
     assert "; 9 members." in verdicts(study(*RISING))[0]
     part = [*RISING[:2], {**RISING[2], "seeds": 4}]
@@ -122,8 +123,8 @@ def test_every_arm_stands_at_its_threshold() -> None:
     others = [
         cell("0 to 1", [0.5], threshold=1.0, threshold_schedule="rising"),
         cell("keeps half", [0.7], keep_rate_target=0.5),
-        cell("coin", [0.1], arm="random-drop", rates_of="0.5"),
-        cell("moved coin", [0.1], arm="random-drop", rates_of="0 to 1"),
+        cell("control", [0.1], arm="random-drop", rates_of="0.5"),
+        cell("moved control", [0.1], arm="random-drop", rates_of="0 to 1"),
     ]
     found = {mark.label: mark for mark in marks(study(*RISING, *others), "A-v0")}
     assert {label: mark.threshold for label, mark in found.items()} == {
@@ -132,29 +133,29 @@ def test_every_arm_stands_at_its_threshold() -> None:
         "1.0": 1.0,
         "0 to 1": 0.9,
         "keeps half": 0.9,
-        "coin": 0.5,
-        "moved coin": 0.9,
+        "control": 0.5,
+        "moved control": 0.9,
     }
-    assert [found[x].kind for x in ("0 to 1", "keeps half")] == ["scheduled", "held keep rate"]
-    page = extra(study(*RISING, *others))
+    assert [found[x].kind for x in ("0 to 1", "keeps half")] == ["scheduled", "target keep rate"]
+    page = report(study(*RISING, *others))
     assert [plot.name for plot in page.plots] == [
-        "dial_keep_rate",
-        "dial_entropy",
-        "dial_coverage",
-        "dial_final_return",
+        "sweep_keep_rate",
+        "sweep_entropy",
+        "sweep_coverage",
+        "sweep_final_return",
     ]
     assert len(page.plots[1].panels[0].lines) == 4
     assert len(text_table(study(*RISING, *others))) == 8
 
 
 def test_what_is_the_same_for_all_follows_nothing() -> None:
-    """And does not keep the other two from being told."""
+    """And does not keep the other two from being found."""
     same = [cell(str(t), [t] * 4, threshold=t) for t in (0.0, 0.5, 1.0)]
     for one in same:
         for member in one["members"]:
             member["final_return"] = 1000.0
-    told = verdicts(study(*same))[0]
-    assert "moves exploration, with no evidence that return follows" in told
+    found = verdicts(study(*same))[0]
+    assert "moves exploration, with no evidence that return follows" in found
 
 
 def test_the_scale_is_the_baselines_first_seed_or_none() -> None:
@@ -175,12 +176,12 @@ def test_the_scale_needs_a_normaliser() -> None:
     spec = {
         "tasks": ["A-v0"],
         "arms": [{"label": "sauna"}],
-        "measure": "dial",
+        "measure": "coverage",
         "checkpoint_every": 10,
         "keep_checkpoints": 1000,
     }
-    assert read_spec(spec).measure == "dial"
-    with pytest.raises(BadInput, match="normalize_observations: dial"):
+    assert read_spec(spec).measure == "coverage"
+    with pytest.raises(BadInput, match="normalize_observations: coverage"):
         read_spec({**spec, "normalize_observations": False})
     with pytest.raises(BadInput, match="needs 'sauna' on B-v0, too"):
         own = {"label": "x", "arm": "sauna", "tasks": ["B-v0"], "baseline": "x2"}
@@ -195,11 +196,12 @@ def test_the_scale_needs_a_normaliser() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["noise", "dial"])
+@pytest.mark.parametrize("name", ["noise", "threshold-sweep"])
 def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> None:
     """The built-in study, on a small task; run again it measures nothing again."""
+    measure = str(load_spec(name).measure)
     text = {**load_spec(name).text, "name": "small", "tasks": ["InvertedPendulum-v5"]}
-    if name == "dial":  # an arm of every kind
+    if measure == "coverage":  # an arm of every kind
         kinds = ("0", "0.8", "1.5", "0 to 1", "keeps 1 in 2", "coin like 0.8")
         text["arms"] = [arm for arm in text["arms"] if arm["label"] in kinds]
     text |= {
@@ -229,19 +231,21 @@ def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> 
 
     assert "measuring" in run()
     place = tmp_path / "runs" / "small"
-    files = {path: path.stat().st_mtime_ns for path in (place / name).glob("*.json")}
+    files = {path: path.stat().st_mtime_ns for path in (place / measure).glob("*.json")}
     assert "measuring" not in run()
     assert files == {path: path.stat().st_mtime_ns for path in files}
-    measured = json.loads((place / f"{name}.json").read_text())
+    measured = json.loads((place / f"{measure}.json").read_text())
     members = [member for cell in measured["cells"] for member in cell["members"]]
     number = [len(member["points"]) for member in members]  # a checkpoint serves one point only
     assert len(members) == len(text["arms"]) and sum(number) == len(files)
     assert set(number) <= {len(ALONG) - 1, len(ALONG)} and len(ALONG) in number
     page = (place / "report.html").read_text()
-    assert 'id="measured"' in page and f"{name}_" in page
-    if name == "dial":
-        held = [c for c in measured["cells"] if c["config"]["keep_rate_target"]]
-        for c in held:
+    assert (
+        'id="measured"' in page and f'id="{"sweep" if measure == "coverage" else measure}_' in page
+    )
+    if measure == "coverage":
+        targets = [c for c in measured["cells"] if c["config"]["keep_rate_target"]]
+        for c in targets:
             for member in c["members"]:
                 assert abs(member["keep_rate"] - c["config"]["keep_rate_target"]) < 0.05
     next(
@@ -257,7 +261,7 @@ def test_a_small_study_measures_once_and_shows_it(name: str, tmp_path: Path) -> 
     items = items_of(spec, units, folder, place)
     assert all(item.is_done for item in items)
     changed = [(items[-1], 1)]  # another checkpoint of the same number is measured again
-    if name == "dial":  # and with the one whose normaliser is the scale, everything is
+    if measure == "coverage":  # and with the one whose normaliser is the scale, everything is
         changed.append((items[0], len(items)))
     for item, lacking in changed:
         manifest = item.run / "checkpoints" / f"{item.iterations[-1]:08d}" / "manifest.json"

@@ -20,20 +20,20 @@ from sauna.experiments import measure
 from sauna.experiments.measure import estimates, noise
 from sauna.experiments.measure.estimates import Gradients, estimate
 from sauna.experiments.measure.gradient import policy_gradient
-from sauna.experiments.measure.noise_report import extra, over_members, text_table, verdicts
+from sauna.experiments.measure.noise_report import over_members, report, text_table, verdicts
 from sauna.experiments.measure.streams import (
     Fresh,
-    Standing,
+    MemberSnapshot,
     Stream,
     fresh_streams,
-    load_standing,
+    load_snapshot,
     moved_in_time,
 )
 from sauna.experiments.study.spec import read_spec
 from sauna.system.errors import BadInput
 
-PAIRS = (("dropped", "coin"),)
-GROUPS = ("dropped", "coin")
+PAIRS = (("dropped", "control"),)
+GROUPS = ("dropped", "control")
 
 
 def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
@@ -140,14 +140,14 @@ def test_estimates_are_unbiased_and_intervals_hold_the_truth(few_resamples: None
             assert np.mean(held[name][place::2]) > 0.85, (name, place)
 
 
-def test_a_coin_finds_no_difference_and_a_real_one_is_found(few_resamples: None) -> None:
+def test_a_random_control_finds_no_difference_and_a_real_one_is_found(few_resamples: None) -> None:
     random, size = np.random.default_rng(1), 20
     means = np.full((2, size), 0.3)
     equal, noisier = 0, 0
     for _ in range(60):
         for spread, names in ((1.0, "equal"), (2.0, "noisier")):
             found = estimate(drawn(random, means, np.array([spread, 1.0])), GROUPS, PAIRS)
-            own = found["differences"]["dropped - coin"]
+            own = found["differences"]["dropped - control"]
             if names == "equal":
                 equal += own["snr"][1] <= 0 <= own["snr"][2]
             else:
@@ -177,13 +177,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def standing(run: Path) -> Standing:
-    return load_standing(run, "sauna/1", 4)
+def snapshot(run: Path) -> MemberSnapshot:
+    return load_snapshot(run, "sauna/1", 4)
 
 
 @pytest.fixture(scope="module")
-def fresh(standing: Standing) -> Fresh:
-    return fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2)
+def fresh(snapshot: MemberSnapshot) -> Fresh:
+    return fresh_streams(snapshot, 2 * noise.MIN_STREAMS, 2)
 
 
 @pytest.fixture(scope="module")
@@ -191,12 +191,14 @@ def streams(fresh: Fresh) -> list[Stream]:
     return fresh.streams
 
 
-def test_streams_are_the_members_next_rollouts(run: Path, standing: Standing, streams: Any) -> None:
-    again = fresh_streams(standing, 2 * noise.LEAST_STREAMS, 2).streams
+def test_streams_are_the_members_next_rollouts(
+    run: Path, snapshot: MemberSnapshot, streams: Any
+) -> None:
+    again = fresh_streams(snapshot, 2 * noise.MIN_STREAMS, 2).streams
     for one, other in zip(streams, again, strict=True):
         assert all(np.array_equal(x, y) for x, y in zip(one, other, strict=True))
     moments = Moments(
-        *(standing.arrays[f"observation_moments/{name}"] for name in ("mean", "variance", "count"))
+        *(snapshot.arrays[f"observation_moments/{name}"] for name in ("mean", "variance", "count"))
     )
     for stream in streams:
         kept, steps = int(stream.keep.sum()), len(stream.keep)
@@ -210,7 +212,7 @@ def test_streams_are_the_members_next_rollouts(run: Path, standing: Standing, st
 
 
 def test_every_env_step_of_a_measurement_is_counted(
-    standing: Standing, monkeypatch: pytest.MonkeyPatch
+    snapshot: MemberSnapshot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken = []
     step = measure.streams._Recorded.step
@@ -220,7 +222,7 @@ def test_every_env_step_of_a_measurement_is_counted(
         return step(self, action, active)
 
     monkeypatch.setattr(measure.streams._Recorded, "step", counted)
-    found = fresh_streams(standing, 3, 1).counts
+    found = fresh_streams(snapshot, 3, 1).counts
     assert found["env_steps_used"] + found["env_steps_thrown_away"] == sum(taken)
     assert found["env_steps_thrown_away"] > 0
 
@@ -241,10 +243,10 @@ def test_a_moved_time_line_keeps_its_order_and_its_bunches() -> None:
 
 
 def test_a_measurement_has_every_estimate(
-    standing: Standing, fresh: Fresh, streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+    snapshot: MemberSnapshot, fresh: Fresh, streams: list[Stream], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noise, "fresh_streams", lambda *given: fresh)
-    found = noise.measure(standing, streams=len(streams))
+    found = noise.measure(snapshot, streams=len(streams))
     assert found["streams"] == {"reference": 8, "tested": 8, "usable": 8}
     assert found["minibatch"] == 16 and found["as_trained"] == "standardized"
     for rule in ("standardized", "raw"):
@@ -253,22 +255,22 @@ def test_a_measurement_has_every_estimate(
         for value, low, high in (groups[g][n] for g in groups for n in ("cosine", "variance")):
             assert low <= value <= high
     json.dumps(found, allow_nan=False)
-    monkeypatch.setattr(noise, "LEAST_STREAMS", 9)
-    assert noise.measure(standing, streams=len(streams))["rules"] == {}  # nothing is claimed
+    monkeypatch.setattr(noise, "MIN_STREAMS", 9)
+    assert noise.measure(snapshot, streams=len(streams))["rules"] == {}  # nothing is claimed
 
 
 def test_minibatches_come_from_their_groups(streams: list[Stream]) -> None:
     stream = streams[0]
     rows = noise.draw(stream, 16, np.random.default_rng(0))
-    kept, dropped, coin, shifted = rows
+    kept, dropped, control, shifted = rows
     assert rows.shape == (4, noise.MINIBATCHES, 16)
     assert stream.keep[kept].all() and not stream.keep[dropped].any()
     assert not stream.shifted[shifted].any()
-    assert 0 < stream.keep[coin].mean() < 1
+    assert 0 < stream.keep[control].mean() < 1
     assert all(len(set(part)) == 16 for part in rows.reshape(-1, 16).tolist())
 
 
-def point(at: float, snr: float, coin: float = 0.010, raw: float = 1.0) -> dict[str, Any]:
+def point(at: float, snr: float, control: float = 0.010, raw: float = 1.0) -> dict[str, Any]:
     groups = {
         name: {
             "snr": [x, 0, 1],
@@ -276,15 +278,20 @@ def point(at: float, snr: float, coin: float = 0.010, raw: float = 1.0) -> dict[
             "alignment": [1.0, 0.9, 1.1],
             "variance": [20.0, 19, 21],
         }
-        for name, x in (("kept", 0.02), ("dropped", snr), ("coin", coin), ("shifted", coin))
+        for name, x in (
+            ("kept", 0.02),
+            ("dropped", snr),
+            ("control", control),
+            ("shifted", control),
+        )
     }
     difference = {
-        "snr": [snr - coin, 0, 0],
-        "cosine": [snr - coin, 0, 0],
+        "snr": [snr - control, 0, 0],
+        "cosine": [snr - control, 0, 0],
         "snr_per_env_step": [0.001, 0, 0],
         "variance_ratio": [1.2, 1, 2],
     }
-    pairs = ("dropped - coin", "kept - coin", "dropped - shifted")
+    pairs = ("dropped - control", "kept - control", "dropped - shifted")
     rules = {
         "standardized": {"groups": groups, "differences": dict.fromkeys(pairs, difference)},
         "raw": {
@@ -319,25 +326,32 @@ def measured(*members: list[dict[str, Any]]) -> dict[str, Any]:
     [
         ((0.002, 0.003, 0.001), "by signal to noise it is noisier than that"),
         ((0.022, 0.023, 0.021), "by signal to noise it is less noisy than that"),
-        ((0.002, 0.018, 0.010), "by signal to noise it is not told from that"),
-        ((0.002,), "by signal to noise it is of too few members"),
+        ((0.002, 0.018, 0.010), "by signal to noise it shows no difference from that"),
+        ((0.002,), "by signal to noise it is underpowered"),
     ],
 )
 def test_the_verdict_follows_the_interval_over_members(snrs: tuple, said: str) -> None:
     found = measured(*([point(0.5, snr), point(1.0, snr)] for snr in snrs))
     assert said in verdicts(found)[0]
-    assert over_members(found["cells"][0], "groups", "coin", "snr").value == pytest.approx(0.01)
-    page = extra(found)
-    assert said in page.html and [len(plot.panels[0].lines) for plot in page.plots] == [4, 4, 4]
+    assert over_members(found["cells"][0], "groups", "control", "snr").value == pytest.approx(0.01)
+    page = report(found)
+    assert said in page.answers[0] and [len(plot.panels[0].lines) for plot in page.plots] == [
+        4,
+        4,
+        4,
+    ]
     assert len(text_table(found)[1]) == len(text_table(found)[0])
 
 
 @pytest.mark.parametrize(
     "ratios, said",
     [
-        ((1.5, 2.0, 2.5), "by variance what the filter drops is noisier than what a coin drops"),
+        (
+            (1.5, 2.0, 2.5),
+            "by variance what the filter drops is noisier than what a matched random",
+        ),
         ((0.5, 0.6, 0.55), "by variance what the filter drops is less noisy than"),
-        ((0.5, 2.0, 1.0), "by variance what the filter drops is not told from"),
+        ((0.5, 2.0, 1.0), "by variance what the filter drops shows no difference from"),
     ],
 )
 def test_variance_is_told_of_advantages_as_they_are(ratios: tuple, said: str) -> None:
@@ -345,7 +359,7 @@ def test_variance_is_told_of_advantages_as_they_are(ratios: tuple, said: str) ->
     found = measured(*([point(0.5, 0.01, raw=x), point(1.0, 0.01, raw=x)] for x in ratios))
     assert said in verdicts(found)[0]
     assert "have 1.200 [1.200, 1.200] times the variance" in verdicts(found)[0]
-    path = ("differences", "dropped - coin", "variance_ratio")
+    path = ("differences", "dropped - control", "variance_ratio")
     mean = over_members(found["cells"][0], *path, raw=True).value
     assert mean == pytest.approx(np.prod(ratios) ** (1 / 3))
 
@@ -370,7 +384,7 @@ def test_where_nothing_was_dropped_nothing_is_said() -> None:
     empty = {**point(0.5, 0.1), "rules": {}}
     assert "no answer, because the filter dropped too few" in verdicts(measured([empty]))[0]
     assert "At 1 of 2 checkpoints" in verdicts(measured([empty, point(1.0, 0.1)]))[0]
-    assert extra(measured([empty])).plots == []
+    assert report(measured([empty])).plots == []
 
 
 SPEC = {

@@ -15,14 +15,14 @@ from PIL import Image
 
 from command_line import sauna
 from sauna.experiments.measure import posture_report
-from sauna.experiments.measure.posture import SIDE, STILLS, clearest, pitch
+from sauna.experiments.measure.posture import FRAMES, SIDE, clearest, pitch
 from sauna.experiments.study.spec import load_spec, read_spec
 from sauna.experiments.study.units import seeds_per_unit, units_of
 from sauna.system.errors import BadInput
 
-TORSO = {
+SPEC = {
     "name": "t",
-    "measure": "torso",
+    "measure": "posture",
     "tasks": ["HalfCheetah-v5"],
     "seeds": 6,
     "arms": [{"label": "ppo"}, {"label": "sauna"}],
@@ -61,13 +61,13 @@ def test_its_runs_are_those_of_the_thirty_seeds() -> None:
     "change, message",
     [
         ({"tasks": ["Hopper-v5"]}, "is of HalfCheetah, not of Hopper-v5"),
-        ({"measure": "torsoo"}, "did you mean 'torso'"),
+        ({"measure": "postur"}, "did you mean 'posture'"),
     ],
 )
-def test_what_has_no_torso_is_refused(change: dict, message: str) -> None:
-    assert read_spec(TORSO).measure == "torso"
+def test_what_has_no_posture_is_refused(change: dict, message: str) -> None:
+    assert read_spec(SPEC).measure == "posture"
     with pytest.raises(BadInput, match=message):
-        read_spec({**TORSO, **change})
+        read_spec({**SPEC, **change})
 
 
 def cell(label: str, upright: list[float], baseline: str | None, seeds: int = 30) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def cell(label: str, upright: list[float], baseline: str | None, seeds: int = 30
             "points": [
                 {
                     "upright": share,
-                    "stills": [*STILLS],
+                    "frames": [*FRAMES],
                     "picture": f"{label}-{seed}.png",
                     "episodes": [{"return": 1000.0 + 2000.0 * (share > 0.5), "upright": share}] * 2,
                 }
@@ -157,10 +157,10 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
         0,
         0,
     ]
-    (tmp_path / "torso").mkdir()
+    (tmp_path / "posture").mkdir()
     for label, level in (("ppo", 0), ("sauna", 200)):
-        strip = Image.new("RGB", (SIDE * len(STILLS), SIDE), (level, 50, 0))
-        strip.save(tmp_path / "torso" / f"{label}-3.png")
+        strip = Image.new("RGB", (SIDE * len(FRAMES), SIDE), (level, 50, 0))
+        strip.save(tmp_path / "posture" / f"{label}-3.png")
     assert posture_report.chosen(found) == (
         "Chosen for the contrast: the first seed of which only sauna is on its feet "
         "(1 of 4; only ppo in 1)."
@@ -168,32 +168,34 @@ def test_the_strip_is_of_a_pair_that_differs(tmp_path: Path) -> None:
     assert "failing that the first of all" in posture_report.chosen(
         measured([0.9, 0.1], [0.9, 0.1])
     )
-    extra = posture_report.extra(found, tmp_path)
-    assert "Chosen for the contrast" in extra.html and "Chosen" in extra.plots[0].caption
-    picture = Image.open(tmp_path / "figures" / "stills.png")
+    section = posture_report.report(found, tmp_path)
+    assert section.image and section.image.png
+    assert (
+        "Chosen for the contrast" in section.image.caption and "Chosen" in section.plots[0].caption
+    )
+    picture = Image.open(tmp_path / "figures" / "frames.png")
     assert picture.width > picture.height
     drawn = np.asarray(picture.convert("RGB"))
     upper, lower = np.array_split(drawn, 2)
     assert (upper == (0, 50, 0)).all(-1).any() and (lower == (200, 50, 0)).all(-1).any()
     assert not (upper == (200, 50, 0)).all(-1).any()
-    [plot] = extra.plots
+    [plot] = section.plots
     assert [(line.label, line.y) for line in plot.panels[0].lines] == [
         ("ppo", [None, 0.1 * 3]),
         ("sauna", [None, 0.1 * 3]),
     ]
-    assert "ppo seed 3, on its back (return 1,000), sauna seed 3, on its feet" in extra.html
-    assert 'src="data:image/png;base64,' in extra.html
+    assert "ppo seed 3, on its back (return 1,000), sauna seed 3, on its feet" in section.image.alt
     for one in found["cells"]:
         for member in one["members"]:
-            member["points"][0] |= {"stills": [], "not_drawn": "no <display>"}
-    assert "<p>No stills: no &lt;display&gt;.</p>" in posture_report.extra(found, tmp_path).html
+            member["points"][0] |= {"frames": [], "not_drawn": "no <display>"}
+    assert posture_report.report(found, tmp_path).image == (None, "", "No frames: no <display>.")
 
 
 @pytest.mark.slow
 def test_a_study_measures_its_finished_members_once(tmp_path: Path, monkeypatch) -> None:
     text = """
 name = "small"
-measure = "torso"
+measure = "posture"
 tasks = ["HalfCheetah-v5"]
 seeds = 2
 steps = 256
@@ -213,10 +215,10 @@ threshold = 0.8
     command = ("study", "small.toml", "--processes", "1")
     done = sauna(*command, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "measuring torso: 4 members" in done.stdout
+    assert "measuring posture: 4 members" in done.stdout
     assert "sauna 0.8 against ppo, seed by seed: no evidence" in done.stdout
     place = tmp_path / "runs" / "small"
-    [*files] = sorted((place / "torso").glob("*.json"))
+    [*files] = sorted((place / "posture").glob("*.json"))
     stored = [json.loads(file.read_text()) for file in files]
     assert len(stored) == 4
     for one in stored:
@@ -224,8 +226,8 @@ threshold = 0.8
         states = [61 * e["upright"] for e in one["episodes"]]
         np.testing.assert_allclose(states, np.round(states), atol=1e-9)
         assert math.isclose(one["upright"], sum(states) / 305)
-        assert not one["stills"] and one["not_drawn"]
-    assert "<p>No stills: " in (place / "report.html").read_text()
+        assert not one["frames"] and one["not_drawn"]
+    assert "<p>No frames: " in (place / "report.html").read_text()
     before = [file.stat().st_mtime_ns for file in files]
     again = sauna(*command, cwd=tmp_path)
     assert again.returncode == 0 and "measuring" not in again.stdout

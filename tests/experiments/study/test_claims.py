@@ -19,7 +19,7 @@ def cell(task: str, label: str, scores: np.ndarray, keep_rate: float = 1.0) -> d
         {
             "status": "complete",
             "final_return": x,
-            "area": -x,
+            "auc": -x,
             "keep_rate": keep_rate,
             "env_steps": 1000.0,
         }
@@ -66,7 +66,7 @@ def test_the_tests_of_a_claim_are_one_family() -> None:
     assert said(study((won, LOW, LOW)))["so"] == "not decided"
 
 
-def test_area_is_judged_by_the_area() -> None:
+def test_the_auc_is_judged_by_the_auc() -> None:
     assert said(study((HIGH, HIGH, HIGH)), claim=1)["so"].startswith("does not hold")
 
 
@@ -102,11 +102,12 @@ def test_no_credit_where_it_filtered_nothing_on_the_task_it_won() -> None:
     )
 
 
-def test_failed_seeds_count_as_ended_and_never_as_scores() -> None:
+def test_failed_seeds_count_as_the_worst_outcome() -> None:
     results = study((HIGH, HIGH, HIGH))
     results["cells"][-1]["members"][0] |= {"status": "failed", "final_return": None}
     assert said(results)["so"] == (
-        "better on A, B, C; better over the tasks by the interval; 1 failed seeds are left out"
+        "better on A, B, not decided on the other 1; better over the tasks by the interval; "
+        "1 failed seeds count as the worst outcome"
     )
 
 

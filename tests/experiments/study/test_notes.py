@@ -28,7 +28,7 @@ def test_it_says_so_exactly_when_no_result_could_be_found() -> None:
         above = {str(arm): (np.arange(number) + 100.0, np.arange(number) * 1.0) for arm in range(3)}
         kinds = {found.kind for found in compare(above).values()}
         spec = comparison("x", ARMS, {"seeds": tuple(range(number))})
-        assert (kinds == {"too few"}) == bool(before_training(spec))
+        assert (kinds == {"underpowered"}) == bool(before_training(spec))
 
 
 def test_many_seeds_may_have_been_one_seed() -> None:

@@ -23,7 +23,8 @@ from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
 from sauna.config.settings import parse
 from sauna.envs.spaces import describe
-from sauna.experiments.study.command import _check_measurable, compare_command, comparison
+from sauna.experiments.measure.measurement import find_measurement
+from sauna.experiments.study.command import compare_command, comparison
 from sauna.experiments.study.execute.process import UnitProcess
 from sauna.experiments.study.results import _ended
 from sauna.experiments.study.spec import built_in, check, load_spec, read_spec
@@ -116,21 +117,20 @@ def test_the_advice_about_checkpoints_can_be_taken(given: dict, advice: tuple) -
     assert read_spec({**text, "checkpoint_every": every, "keep_checkpoints": kept}).measure
 
 
-def test_pictures_are_not_measured() -> None:
+def test_images_are_not_measured() -> None:
     config = check(read_spec(TWO).arms[1], "A-v0")
     spaces = describe(Box(0, 255, (84, 84, 4), np.uint8), Discrete(3))
-    for measure, changed in (("noise", {}), ("dial", {"normalize_observations": False})):
-        spec = read_spec(TWO)._replace(measure=measure)
+    for measure, changed in (("noise", {}), ("coverage", {"normalize_observations": False})):
         with pytest.raises(BadInput, match=f"measure: {measure}"):
-            _check_measurable(spec, dataclasses.replace(config, **changed), spaces)
-    _check_measurable(read_spec(TWO)._replace(measure="dial"), config, spaces)
+            find_measurement(measure).check_spaces(dataclasses.replace(config, **changed), spaces)
+    find_measurement("coverage").check_spaces(config, spaces)
 
 
-def test_the_area_is_that_of_the_budget() -> None:
+def test_the_auc_is_that_of_the_budget() -> None:
     rows = [{"env_steps": n, "return_mean": float(n)} for n in (100, 200, 300, 400)]
-    assert _ended(rows, 300)["area"] == 200.0
-    assert _ended(rows, 400)["area"] == 250.0
-    assert _ended([], 400)["area"] is None
+    assert _ended(rows, 300)["auc"] == 200.0
+    assert _ended(rows, 400)["auc"] == 250.0
+    assert _ended([], 400)["auc"] is None
 
 
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
@@ -165,7 +165,8 @@ def test_studies_of_the_paper(name: str) -> None:
             assert config.budget == base.budget or "kept steps" in arm.label
     assert {a.arm for a in spec.arms} <= set(ARMS)
     if name == "fig3":
-        assert {a.arm for a in spec.arms} == set(ARMS)
+        paper = {"ppo", "vex-head", "random-drop", "sauna", "sauna-paper", "sauna-reference"}
+        assert {a.arm for a in spec.arms} == paper
         assert {len(a.seeds) for a in spec.arms} == {6} and len(spec.tasks) == 6
 
 
@@ -436,7 +437,7 @@ def test_lines_that_are_no_messages_are_passed_over(tmp_path: Path, monkeypatch)
 
 def test_what_a_run_would_refuse_is_refused_before_anything_is_made(tmp_path: Path) -> None:
     done = sauna("compare", "CartPole-v1", "--log-std-init", "0.5", cwd=tmp_path)
-    assert done.returncode == 2 and "not read with discrete actions" in done.stderr
+    assert done.returncode == 2 and "it needs continuous actions" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 

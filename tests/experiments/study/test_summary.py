@@ -28,7 +28,7 @@ ROW = {
     "failed",
     "running",
     "final_iqm",
-    "area_iqm",
+    "auc_iqm",
     "final_mean",
     "final_std",
     "keep_rate",
@@ -46,7 +46,7 @@ def member(seed: int, final: float | None, **changes: Any) -> dict[str, Any]:
         "status": "complete",
         "error": None,
         "final_return": final,
-        "area": half,
+        "auc": half,
         "env_steps": 3000,
         "kept_steps": int(3000 * keep_rate),
         "keep_rate": keep_rate,
@@ -94,39 +94,39 @@ def test_better_worse_and_no_evidence() -> None:
     better = verdict(cell("ppo", LOW), cell("sauna", HIGH, keep_rate=0.7))
     assert better["kind"] == "better"
     assert better["text"] == (
-        "sauna: better than ppo on Cheetah (P(better) = 1.00 [0.67, 1.00], exact p = 0.002, "
-        "6 against 6 seeds)."
+        "sauna: better than ppo on Cheetah (probability of improvement 1.00 [0.67, 1.00], "
+        "exact p = 0.002, 6 against 6 seeds)."
     )
     worse = verdict(cell("ppo", HIGH), cell("sauna", LOW, keep_rate=0.7))
     assert (worse["kind"], worse["text"][:29]) == ("worse", "sauna: worse than ppo on Chee")
     alike = verdict(cell("ppo", LOW), cell("sauna", ALIKE, keep_rate=0.7))
     assert alike["kind"] == "no evidence"
-    assert alike["text"].startswith("sauna: no evidence of a difference from ppo on Cheetah (P(")
+    assert alike["text"].startswith("sauna: no evidence of a difference from ppo on Cheetah (p")
     assert "more than 1000 seeds of each would be needed" in alike["text"]
 
 
 def test_no_difference_at_all_names_no_number_of_seeds() -> None:
     text = verdict(cell("ppo", LOW), cell("sauna", LOW, keep_rate=0.7))["text"]
-    assert "P(better) = 0.50 [0.21, 0.79]" in text and "needed" not in text
+    assert "probability of improvement 0.50 [0.21, 0.79]" in text and "needed" not in text
 
 
 def test_too_few_seeds_says_how_many() -> None:
     found = verdict(cell("ppo", LOW[:3]), cell("sauna", HIGH[:3], keep_rate=0.7))
-    assert found["kind"] == "too few"
+    assert found["kind"] == "underpowered"
     assert found["text"] == (
-        "sauna: too few seeds to say anything against ppo on Cheetah: 3 against 3 complete; at "
+        "sauna: too few seeds to say anything against ppo on Cheetah: 3 against 3 ended; at "
         "least 4 of each are needed, and about 6 for a difference as large as the one seen, were "
         "it the true one (80% power)."
     )
     one = verdict(cell("ppo", LOW), cell("sauna", HIGH[:1], keep_rate=0.7))["text"]
-    assert "1 against 6 complete; at least 4 of each are needed." in one
+    assert "1 against 6 ended; at least 4 of each are needed." in one
 
 
 def test_nothing_to_compare_with() -> None:
     for cells in [[cell("sauna", HIGH)], [cell("ppo", []), cell("sauna", HIGH)]]:
         summary = summarize(results(*cells))
-        assert summary["verdicts"][0]["kind"] == "too few"
-        assert "6 against 0 complete; at least 4 of each" in summary["verdicts"][0]["text"]
+        assert summary["verdicts"][0]["kind"] == "underpowered"
+        assert "6 against 0 ended; at least 4 of each" in summary["verdicts"][0]["text"]
         assert summary["table"][-1]["improvement"] == [None, None, None]
     assert summarize(results(cell("ppo", LOW)))["verdicts"] == []
     assert summarize(results())["table"] == []
@@ -164,23 +164,69 @@ def test_a_mean_that_goes_the_other_way_is_mentioned() -> None:
     assert "Its mean final return is lower all the same." in found["text"]
 
 
-def test_members_that_are_not_complete_never_count() -> None:
+def test_members_that_still_train_never_count() -> None:
     arm = cell("sauna", HIGH, keep_rate=0.7)
-    for seed, status in enumerate(["failed", "running", "waiting", "failed"], start=6):
+    for seed, status in enumerate(["running", "waiting"], start=6):
         extra = member(seed, 9e9, status=status)
         extra["curve"]["env_steps"] = [1, 2, 3]
         arm["members"].append(extra)
     with_them = summarize(results(cell("ppo", LOW), arm))
     without = summarize(results(cell("ppo", LOW), cell("sauna", HIGH, keep_rate=0.7)))
     row = with_them["table"][1]
-    assert (row["seeds"], row["failed"], row["running"]) == (6, 2, 1)
-    assert {**row, "failed": 0, "running": 0} == without["table"][1]
+    assert (row["seeds"], row["failed"], row["running"]) == (6, 0, 1)
+    assert {**row, "running": 0} == without["table"][1]
     assert with_them["curves"] == without["curves"]
     assert with_them["profiles"] == without["profiles"]
     text = with_them["verdicts"][0]["text"]
     assert text.startswith(without["verdicts"][0]["text"])
-    assert "Failed seeds are left out (2 of sauna)" in text
     assert "Not finished yet: 2 of sauna;" in text
+
+
+def failing(values: list[float], failed: int) -> dict[str, Any]:
+    """An arm of complete members and, behind them, of failed ones with a return of no meaning."""
+    arm = cell("sauna", values, keep_rate=0.7)
+    arm["members"] += [member(len(values) + i, 9e9, status="failed") for i in range(failed)]
+    return arm
+
+
+def test_a_failed_seed_is_the_worst_outcome_of_the_test() -> None:
+    """As if it had ended below every other seed; numbers of the complete ones stay theirs."""
+    with_it = summarize(results(cell("ppo", LOW), failing(HIGH, 2)))
+    lowest = summarize(results(cell("ppo", LOW), cell("sauna", [*HIGH, -9e9, -9e9], keep_rate=0.7)))
+    found, expected = with_it["verdicts"][0], lowest["verdicts"][0]
+    assert found["chance"] == expected["chance"] == 6 / 8
+    assert found["text"].startswith(expected["text"]) and "8 against 6 seeds" in found["text"]
+    assert found["text"].endswith("Failed seeds count as the worst outcome: 2 of sauna.")
+    without = summarize(results(cell("ppo", LOW), failing(HIGH, 0)))
+    assert with_it["table"][1]["final_iqm"] == without["table"][1]["final_iqm"]
+    assert with_it["table"][1]["failed"] == 2
+    assert with_it["curves"] == without["curves"]
+    assert with_it["profiles"]["Cheetah"]["sauna"]["share"][0] == 6 / 8
+    json.dumps(with_it, allow_nan=False)
+
+
+@pytest.mark.parametrize("failed, kind", [(2, "better"), (3, "too many failed")])
+def test_above_a_quarter_of_failed_seeds_there_is_no_verdict(failed: int, kind: str) -> None:
+    """Of 11 seeds that end far above the baseline where they end at all."""
+    high = [2000.0 + i for i in range(11 - failed)]
+    found = verdict(cell("ppo", [1000.0 + i for i in range(11)]), failing(high, failed))
+    assert found["kind"] == kind
+    said = "too many seeds failed (3 of 11 of sauna; at most 25% may fail)"
+    assert (said in found["text"]) == (failed == 3)
+
+
+def test_a_baseline_that_failed_gives_no_verdict_either() -> None:
+    base = {**failing(LOW, 3), "label": "ppo", "arm": "ppo"}
+    assert verdict(base, cell("sauna", HIGH, keep_rate=0.7))["kind"] == "too many failed"
+
+
+def test_results_of_before_hold_the_auc_as_area() -> None:
+    new = results(cell("ppo", LOW), cell("sauna", HIGH))
+    old = copy.deepcopy(new)
+    for one in (m for c in old["cells"] for m in c["members"]):
+        one["area"] = one.pop("auc")
+    assert summarize(old) == summarize(new)
+    assert summarize(new)["table"][0]["auc_iqm"][0] is not None
 
 
 def test_complete_seeds_without_a_return_are_left_out_and_said_so() -> None:
@@ -207,24 +253,29 @@ def test_several_arms_are_corrected_together() -> None:
     assert "The interval leaves out 0.5, but the test, which decides, does not." in both["text"]
 
 
-def test_the_filter_is_held_against_the_head_alone_and_its_coin() -> None:
-    """All three beat the baseline; what the head alone does is no merit of the filter."""
-    coin = {**cell("coin", ALIKE, arm="random-drop", keep_rate=0.7), "rates_of": "sauna"}
-    other = {**cell("other coin", LOW, arm="random-drop", keep_rate=0.7), "rates_of": "elsewhere"}
+def test_a_filter_is_compared_with_its_head_only_ablation_and_its_random_control() -> None:
+    """All three beat the baseline; what the head does without it is no merit of the filter."""
+    control = {**cell("control", ALIKE, arm="random-drop", keep_rate=0.7), "rates_of": "sauna"}
+    other = {
+        **cell("other control", LOW, arm="random-drop", keep_rate=0.7),
+        "rates_of": "elsewhere",
+    }
     arms = [
         cell("ppo", [0.0] * 6),
         cell("vex-head", LOW),
         other,
-        coin,
+        control,
         cell("sauna", HIGH, keep_rate=0.7),
     ]
     found = summarize(results(*arms))
     assert [v["kind"] for v in found["verdicts"]] == ["better"] * 4
-    told = {v["against"]: v for v in found["filtering"]}
-    assert set(told) == {"vex-head", "coin"}
-    assert [(v["label"], v["kind"]) for v in told.values()] == [("sauna", "better")] * 2
-    assert "sauna: better than coin on Cheetah" in told["coin"]["text"]
-    assert "exact p = 0.004 after Holm's correction for 2 comparisons" in told["coin"]["text"]
+    found_of = {v["against"]: v for v in found["filtering"]}
+    assert set(found_of) == {"vex-head", "control"}
+    assert [(v["label"], v["kind"]) for v in found_of.values()] == [("sauna", "better")] * 2
+    assert "sauna: better than control on Cheetah" in found_of["control"]["text"]
+    assert (
+        "exact p = 0.004 after Holm's correction for 2 comparisons" in found_of["control"]["text"]
+    )
     arms[-1] = cell("sauna", ALIKE, keep_rate=0.7)
     found = summarize(results(*arms))
     assert found["verdicts"][-1]["kind"] == "better"
@@ -243,7 +294,7 @@ def test_the_filter_is_held_against_the_head_alone_and_its_coin() -> None:
     assert summarize(results(*arms[:2], ruled))["filtering"] == []  # another head, of other rules
 
 
-def test_a_baseline_that_filtered_nothing_is_told() -> None:
+def test_a_baseline_that_filtered_nothing_is_named() -> None:
     stored = {**results(cell("sauna", LOW, keep_rate=1.0), cell("ppo", HIGH)), "baseline": "sauna"}
     text = summarize(stored)["verdicts"][0]["text"]
     assert "sauna dropped none of its steps, so no difference can be credited" in text
@@ -265,12 +316,12 @@ def test_words_and_intervals_agree_on_random_studies() -> None:
         for found in summarize(results(*cells[: 2 + trial % 2]))["verdicts"]:
             kinds.add(found["kind"])
             interval = re.search(r"\[([\d.]+), ([\d.]+)\], exact p (= ([\d.]+)|<)", found["text"])
-            assert (interval is None) == (found["kind"] == "too few")
+            assert (interval is None) == (found["kind"] == "underpowered")
             if interval and found["kind"] != "no evidence":
                 low, high, p = (float(interval[i] or 0) for i in (1, 2, 4))
                 assert low > 0.5 if found["kind"] == "better" else high < 0.5
                 assert p < 0.05
-    assert kinds == {"better", "worse", "no evidence", "too few"}
+    assert kinds == {"better", "worse", "no evidence", "underpowered"}
 
 
 def test_table_by_hand() -> None:
@@ -279,7 +330,7 @@ def test_table_by_hand() -> None:
     assert set(ppo) == set(sauna) == ROW
     assert (ppo["improvement"], sauna["improvement"][0]) == (None, 1.0)
     assert sauna["final_iqm"][0] == np.mean(sorted(HIGH)[1:5])
-    assert sauna["area_iqm"][0] == sauna["final_iqm"][0] / 2
+    assert sauna["auc_iqm"][0] == sauna["final_iqm"][0] / 2
     assert sauna["final_mean"] == np.mean(HIGH)
     assert sauna["final_std"] == np.std(HIGH, ddof=1)
     assert (sauna["keep_rate"], sauna["env_steps"], sauna["kept_steps"]) == (0.5, 3000, 1500)
@@ -289,7 +340,7 @@ def test_one_seed_and_none_are_null_and_not_zero() -> None:
     one, none = summarize(results(cell("ppo", LOW[:1]), cell("sauna", [])))["table"]
     assert one["final_iqm"] == [1300.0, None, None]
     assert (one["final_mean"], one["final_std"]) == (1300.0, None)
-    assert none["final_iqm"] == none["area_iqm"] == [None, None, None]
+    assert none["final_iqm"] == none["auc_iqm"] == [None, None, None]
     assert [none[k] for k in ("final_mean", "final_std", "keep_rate", "env_steps")] == [None] * 4
 
 

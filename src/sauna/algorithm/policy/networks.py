@@ -21,15 +21,21 @@ def dense(width: int, gain: float, name: str) -> nn.Dense:
 
 
 class MLP(nn.Module):
-    """`[..., obs]` -> `[..., hidden[-1]]`, one activation after each layer."""
+    """`[..., obs]` -> `[..., hidden[-1]]`, one activation after each layer.
+
+    Bytes `[..., H, W, C]` become one vector in [0, 1]: they are divided by `high`.
+    """
 
     hidden: Sequence[int]
     activation: str = "tanh"
+    high: float = 255.0
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
         activate = {"tanh": nn.tanh, "relu": nn.relu}[self.activation]
         x = observation
+        if x.dtype == jnp.uint8:
+            x = x.reshape((*x.shape[:-3], -1)).astype(jnp.float32) / self.high
         for i, width in enumerate(self.hidden):
             x = activate(dense(width, math.sqrt(2.0), f"layer_{i}")(x))
         return x
@@ -51,13 +57,18 @@ class Convolution(nn.Module):
 class NatureCNN(nn.Module):
     """Images `[..., H, W, C]` -> `[..., 512]` (Mnih et al. 2015, as in baselines).
 
-    uint8 images are scaled to [0, 1] here, so that rollouts hold bytes.
+    uint8 images are scaled to [0, 1] here, so that rollouts hold bytes: they are divided by
+    `high`.
     """
+
+    high: float = 255.0
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
         lead = observation.shape[:-3]
         x = observation.reshape((-1, *observation.shape[-3:]))
+        if x.dtype == jnp.uint8 and self.high != 255.0:  # which `convolutions` divides by
+            x = x.astype(jnp.float32) / self.high
         layers, channels = [], x.shape[-1]
         for i, (features, width, _) in enumerate(LAYERS):
             layers.append(Convolution(features, width, name=f"conv_{i}")(channels))
@@ -74,14 +85,14 @@ class ActorCritic(nn.Module):
     arms with and without it share one program and one initialisation.
 
     Attributes:
-      make_trunk: builds the trunk module under a given name.
+      make_trunk: builds the trunk module under a given name, as a part of a given module.
       num_outputs: width of the policy head.
       log_std_init: start of the state-independent log-std, or None for discrete actions.
       shared: one trunk for all heads.
       predicted: width of the auxiliary head, which stands beside the value head; 0: there is none.
     """
 
-    make_trunk: Callable[[str], nn.Module]
+    make_trunk: Callable[[str, nn.Module], nn.Module]
     num_outputs: int
     log_std_init: float | None
     shared: bool
@@ -90,9 +101,10 @@ class ActorCritic(nn.Module):
     @nn.compact
     def __call__(self, observation: Array) -> PolicyOutput:
         """`[..., *obs]` -> `PolicyOutput` with leading axes `[...]`."""
-        policy_features = self.make_trunk("trunk" if self.shared else "policy_trunk")(observation)
+        first = self.make_trunk("trunk" if self.shared else "policy_trunk", self)
+        policy_features = first(observation)
         value_features = (
-            policy_features if self.shared else self.make_trunk("value_trunk")(observation)
+            policy_features if self.shared else self.make_trunk("value_trunk", self)(observation)
         )
         hidden = policy_features
         policy = dense(self.num_outputs, 0.01, "policy_head")(policy_features)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -23,7 +24,7 @@ from sauna.algorithm.types import Array, Params, PolicyOutput
 from sauna.config.plugins import import_name
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, one_line
 
 
 class Policy(NamedTuple):
@@ -50,26 +51,35 @@ def make_distribution(spaces: Spaces) -> Distribution:
     return multi_categorical(spaces.action_sizes)
 
 
-def make_trunk(config: Config, spaces: Spaces) -> Callable[[str], nn.Module]:
-    """A function that builds the trunk `config.network` names.
+def make_trunk(config: Config, spaces: Spaces) -> Callable[[str, nn.Module | None], nn.Module]:
+    """A function `(name, parent) -> trunk` that builds what `config.network` names.
 
     Raises:
-      BadInput: a user's `module:name` is not a flax module.
+      BadInput: a user's `module:name` is not a flax module, nor a function that gives one.
     """
+    high = spaces.observation_high
     if config.network == "mlp":
-        return partial(_named, MLP, hidden=config.hidden, activation=config.activation)
+        settings = {"hidden": config.hidden, "activation": config.activation, "high": high}
+        return partial(_named, partial(MLP, **settings))
     if config.network == "nature-cnn":
-        return partial(_named, NatureCNN)
+        return partial(_named, partial(NatureCNN, high=high))
     make = import_name("network", config.network)
-    if isinstance(make, nn.Module):
-        return lambda name: make.clone(name=name)
     if isinstance(make, type) and issubclass(make, nn.Module):
         return partial(_named, make)
-    raise BadInput(f"network: {config.network} is not a flax.linen module")
+    module, why = make, ""
+    if callable(make) and not isinstance(make, type | nn.Module):
+        try:
+            module = make()  # a partial, or a function of the user's
+        except Exception as error:
+            why = f": calling it raises {one_line(error)}"
+    if not isinstance(module, nn.Module):
+        raise BadInput(f"network: {config.network} is not a flax.linen module{why}")
+    # Copied with its parts: flax lets modules that hold the same instance share its parameters.
+    return lambda name, parent: copy.deepcopy(module).clone(name=name, parent=parent)
 
 
-def _named(module: Callable[..., nn.Module], name: str, **settings: Any) -> nn.Module:
-    return module(name=name, **settings)
+def _named(make: Callable[..., nn.Module], name: str, parent: nn.Module | None) -> nn.Module:
+    return make(name=name, parent=parent)
 
 
 def _unraveler(example: Params) -> Callable[[Array], Params]:
@@ -89,7 +99,11 @@ def _unraveler(example: Params) -> Callable[[Array], Params]:
 
 
 def make_policy(config: Config, spaces: Spaces) -> Policy:
-    """The policy that `config` describes for environments with these `spaces`."""
+    """The policy that `config` describes for environments with these `spaces`.
+
+    Raises:
+      BadInput: the network is none, or keeps more than parameters.
+    """
     distribution = make_distribution(spaces)
     network = ActorCritic(
         make_trunk(config, spaces),
@@ -99,7 +113,9 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         0 if config.auxiliary == "none" else spaces.observation_shape[0],
     )
     example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
-    unravel = _unraveler(jax.eval_shape(network.init, jax.random.key(0), example))
+    variables = jax.eval_shape(network.init, jax.random.key(0), example)
+    check_collections(config, variables)
+    unravel = _unraveler(variables)
 
     def init(key: Array) -> Array:
         return ravel_pytree(network.init(key, example))[0]
@@ -108,6 +124,16 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         return network.apply(unravel(params), observation)
 
     return Policy(init, apply, unravel, distribution)
+
+
+def check_collections(config: Config, variables: Params) -> None:
+    """Refuses a network with a state beside its parameters, which Adam must not train."""
+    others = sorted(set(variables) - {"params"})
+    if others:
+        raise BadInput(
+            f"network: {config.network} keeps {', '.join(others)} beside its parameters, which "
+            "training does not carry; instead of BatchNorm use LayerNorm or GroupNorm"
+        )
 
 
 def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Array:

@@ -1,7 +1,7 @@
 """How the members of a process choose actions at each vector step.
 
 Acting needs the policy head alone: log-probabilities, values and Vex are computed afterwards for a
-whole stretch (`Program.score`). For an MLP the few small products are a loop of our own, because a
+whole segment (`Program.score`). For an MLP the few small products are a loop of our own, because a
 call of a JAX program costs more than they do; another network acts by such a call.
 """
 
@@ -174,6 +174,6 @@ def _largest(logits: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
 
 def make_actor(config: Config, spaces: Spaces, policy: Policy, act: Any, members: int) -> Actor:
     """The fastest actor for the network of `config`."""
-    if config.network == "mlp":
+    if config.network == "mlp" and spaces.observation_kind != "image":
         return MLPActor(config, spaces, policy, members)
     return CompiledActor(act)

@@ -51,18 +51,18 @@ class JaxEnv(NamedTuple):
     frames_per_second: float = 30.0
 
 
-def ended_where_broken(told: Transition) -> Transition:
+def ended_where_broken(transition: Transition) -> Transition:
     """A simulation whose numbers are not finite any more ends its episode, with zeros to see.
 
-    For physics alone, where that is a known end; other environments are told of as faulty.
+    For physics alone, where that is a known end; other environments are reported as faulty.
     """
-    sound = jnp.all(jnp.isfinite(told.observation)) & jnp.isfinite(told.reward)
-    terminated = told.terminated | ~sound
-    return told._replace(
-        observation=jnp.where(sound, told.observation, 0.0),
-        reward=jnp.where(sound, told.reward, 0.0),
+    sound = jnp.all(jnp.isfinite(transition.observation)) & jnp.isfinite(transition.reward)
+    terminated = transition.terminated | ~sound
+    return transition._replace(
+        observation=jnp.where(sound, transition.observation, 0.0),
+        reward=jnp.where(sound, transition.reward, 0.0),
         terminated=terminated,
-        truncated=told.truncated & ~terminated,
+        truncated=transition.truncated & ~terminated,
     )
 
 
@@ -75,10 +75,10 @@ class Running(NamedTuple):
     first: Any  # (state, observation) that `reset="cached"` returns to, else ()
 
 
-def flat(env: JaxEnv) -> JaxEnv:
+def flat(env: JaxEnv, rescale: bool = False) -> JaxEnv:
     """`env` with the arrays that the learner has: observations `[*Spaces.observation_shape]`,
-    actions `[A]`, which are clipped here and nowhere else."""
-    read, write = _reader(env.observation_space), _writer(env.action_space)
+    actions `[A]`, which are clipped (or stretched: `rescale`) here and nowhere else."""
+    read, write = _reader(env.observation_space), _writer(env.action_space, rescale)
 
     def reset(key: Array) -> tuple[State, Array]:
         state, observation = env.reset(key)
@@ -103,8 +103,11 @@ def _reader(space: Any) -> Callable[[Any], Array]:
 
     if isinstance(space, gym.Discrete):
         return lambda x: jax.nn.one_hot(x - space.start, int(space.n))
-    if isinstance(space, gym.Dict):
-        readers = {name: _reader(part) for name, part in space.spaces.items()}
+    if isinstance(space, gym.MultiDiscrete):
+        return _reader_of_choices(space)
+    if isinstance(space, gym.Dict | gym.Tuple):
+        parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
+        readers = {name: _part_reader(part) for name, part in parts}
         return lambda x: jnp.concatenate([read(x[name]) for name, read in readers.items()])
     kind, shape = describe_observation(space)
     if kind == "image":
@@ -114,12 +117,44 @@ def _reader(space: Any) -> Callable[[Any], Array]:
     return lambda x: jnp.asarray(x, jnp.float32).reshape(-1)
 
 
-def _writer(space: Any) -> Callable[[Array], Any]:
+def _part_reader(space: Any) -> Callable[[Any], Array]:
+    """Of a part of a Dict or Tuple, where also bytes become numbers of a vector."""
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Box | gym.MultiBinary):
+        return lambda x: jnp.asarray(x, jnp.float32).reshape(-1)
+    return _reader(space)
+
+
+def _reader_of_choices(space: Any) -> Callable[[Any], Array]:
+    """Of several choices: their one-hots, one after the other."""
+    sizes, starts = space.nvec.ravel(), np.broadcast_to(space.start, space.nvec.shape).ravel()
+
+    def read(x: Any) -> Array:
+        chosen = jnp.asarray(x).reshape(-1) - starts
+        return jnp.concatenate([jax.nn.one_hot(chosen[i], int(n)) for i, n in enumerate(sizes)])
+
+    return read
+
+
+def _writer(space: Any, rescale: bool) -> Callable[[Array], Any]:
     """The device's twin of `spaces.action_writer`."""
     from gymnasium import spaces as gym
 
+    from sauna.envs.spaces import stretch
+
     if isinstance(space, gym.Box):
         low, high = space.low.ravel(), space.high.ravel()
+        stretched = stretch(space) if rescale else None
+        if stretched is not None:
+            bounded, center, half = (jnp.asarray(x) for x in stretched)
+
+            def write(action: Array) -> Array:
+                inner = jnp.where(bounded, jnp.clip(action, -1.0, 1.0), action)
+                moved = (center + half * inner).astype(action.dtype)
+                return jnp.clip(moved, low, high).reshape(space.shape)
+
+            return write
         return lambda action: jnp.clip(action, low, high).reshape(space.shape)
     if isinstance(space, gym.Discrete):
         return lambda action: action[0] + int(space.start)
@@ -144,7 +179,7 @@ def advance(
     action: Array,
     acting: Array,
     key: Array,
-    anywhere: Callable[[Array], Array],
+    any_member: Callable[[Array], Array],
 ) -> tuple[Running, Transition]:
     """One env step of the acting environments; where an episode ends, the next one begins.
 
@@ -152,7 +187,7 @@ def advance(
       action: `[N, A]`; acting: `[N]` bool, the others stay where they are.
       key: the one given to `begin`; episode e of environment n is reset with a key made of it, n
         and e. Not read with cached resets, which return to the environment's first state.
-      anywhere: `bool -> bool`, whether it holds in any member that is compiled together with this
+      any_member: `bool -> bool`, whether it holds in any member that is compiled together with this
         one: then alone is the reset computed.
 
     Returns:
@@ -172,11 +207,11 @@ def advance(
     if running.first:
         start = _with_new_keys(running.first, episode)
     else:
-        start = jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
+        start = jax.lax.cond(any_member(jnp.any(ended)), fresh, lambda: reached)
     now = (running.state, running.observation)
     state, observation = _where(acting, _where(ended, start, reached), now)
-    told = transition._replace(terminated=terminated, truncated=truncated)
-    return Running(state, observation, episode, running.first), told
+    transition = transition._replace(terminated=terminated, truncated=truncated)
+    return Running(state, observation, episode, running.first), transition
 
 
 def _with_new_keys(first: Any, episode: Array) -> Any:

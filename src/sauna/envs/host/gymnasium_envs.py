@@ -7,19 +7,26 @@ the snapshot. That is exact for every environment that is deterministic given th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from sauna.envs.host.answers import close, life_lost, one_number, reset_with
 from sauna.envs.host.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.system.errors import SaunaError, one_line
 
+LARGEST = 1e38  # of an observation or a reward: float32 and the running moments hold no more
+
 
 class EnvironmentFailure(SaunaError):
     """An environment raised, or gave numbers that cannot be learned from."""
+
+
+def _square(x: np.ndarray) -> float:
+    """The sum of squares: NaN or infinite where a number is, or is too large to be squared."""
+    return float(np.vdot(x, x))
 
 
 class Slot:
@@ -39,14 +46,17 @@ class GymnasiumEnvs(HostEnvs):
     Args:
       make: makes one environment.
       seeds: `(member seed, env index)` of each environment.
+      rescale: as of `action_writer`.
     """
 
-    def __init__(self, make: Callable[[], Any], seeds: Sequence[tuple[int, int]]) -> None:
+    def __init__(
+        self, make: Callable[[], Any], seeds: Sequence[tuple[int, int]], rescale: bool = False
+    ) -> None:
         self._slots = [Slot(make(), pair) for pair in seeds]
         env = self._slots[0].env
         self.spaces = describe(env.observation_space, env.action_space)
         self._read = observation_reader(env.observation_space)
-        self._write = action_writer(env.action_space)
+        self._write = action_writer(env.action_space, rescale)
         number, shape = len(self._slots), self.spaces.observation_shape
         dtype = np.uint8 if self.spaces.observation_kind == "image" else np.float64
         self._observation = np.zeros((number, *shape), dtype)
@@ -68,7 +78,8 @@ class GymnasiumEnvs(HostEnvs):
         slot.episode += 1
         slot.actions = []
         try:
-            observation, _ = slot.env.reset(seed=episode_seed(*slot.seeds, slot.episode))
+            seed = episode_seed(*slot.seeds, slot.episode)
+            observation = reset_with(slot.env, seed)
         except Exception as error:
             raise EnvironmentFailure(f"{slot.name}: reset raised {one_line(error)}") from error
         self._put(self._observation, index, observation)
@@ -116,34 +127,40 @@ class GymnasiumEnvs(HostEnvs):
         """Steps one environment; whether its episode ended, or a life of it was lost."""
         slot.actions.append(action)
         try:
-            observation, reward, terminated, truncated, info = self._take(slot, action)
+            observation, given, terminated, truncated, info = self._take(slot, action)
+            self._reward[index] = one_number(given)
+            lost = life_lost(info)
         except Exception as error:
             raise EnvironmentFailure(f"{slot.name}: step raised {one_line(error)}") from error
-        self._reward[index] = reward
         if terminated or truncated:
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
             self._put(self._final, index, observation)
-            self._final_sum = self._final.sum()
+            self._final_sum = _square(self._final)
             self._check_finite(np.arange(len(self._slots)) == index)
             self._start_episode(index, slot)
             return True
         self._put(self._observation, index, observation)
-        self._life_lost[index] = lost = bool(info.get("life_lost", False))
+        self._life_lost[index] = lost
         return lost
 
     def _check_finite(self, active: np.ndarray) -> None:
-        """One sum tells whether anything is amiss; only then the culprit is looked for."""
+        """Refuses what is not finite, or too large: one sum tells; then the culprit is looked for.
+
+        Raises:
+          EnvironmentFailure: naming the environment, the step and the number.
+        """
         if self._is_finite():
             return
         for index in np.flatnonzero(active).tolist():
             slot = self._slots[index]
             where = f"{slot.name}, episode {slot.episode}, step {self._steps_taken(index)}"
-            if not np.isfinite(self._reward[index]):
+            if not abs(self._reward[index]) <= LARGEST:
                 raise EnvironmentFailure(f"{where}: reward is {self._reward[index]}")
             for row in (self._observation[index], self._final[index]):
-                if not np.isfinite(row).all():
-                    component = int(np.flatnonzero(~np.isfinite(row))[0])
+                usable = np.abs(row) <= LARGEST
+                if not usable.all():
+                    component = int(np.flatnonzero(~usable)[0])
                     value = row.reshape(-1)[component]
                     raise EnvironmentFailure(f"{where}: observation[{component}] is {value}")
 
@@ -153,8 +170,9 @@ class GymnasiumEnvs(HostEnvs):
 
     def _is_finite(self) -> bool:
         if self.spaces.observation_kind == "image":  # bytes are finite, and many
-            return math.isfinite(self._reward.sum())
-        return math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum)
+            return _square(self._reward) <= LARGEST**2
+        squares = _square(self._observation) + _square(self._reward) + self._final_sum
+        return squares <= LARGEST**2
 
     def snapshot(self, index: int) -> Snapshot:
         slot = self._slots[index]
@@ -180,4 +198,4 @@ class GymnasiumEnvs(HostEnvs):
 
     def close(self) -> None:
         for slot in self._slots:
-            slot.env.close()
+            close(slot.env, slot.name)

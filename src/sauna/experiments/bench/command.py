@@ -53,7 +53,7 @@ def bench(
       iterations: of each round's training, beyond the warm-up.
       rounds: how often everything is measured, in turn.
       against: a peer, or None; script: the file that the peer `cleanrl` is.
-      say: is told of each figure.
+      say: receives a line for each figure.
 
     Returns:
       the figures; rates are env steps per second, summed over all processes.
@@ -127,7 +127,7 @@ def _check_peer(config: Config, overrides: Mapping[str, Any], against: str) -> N
 def bench_scale(
     overrides: Mapping[str, Any], rounds: int, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """The rate against members, environments, width and processes, with the machine named.
+    """Returns the rate against members, environments, width and processes, with the machine named.
 
     Raises:
       BadInput: the settings are not usable.
@@ -160,7 +160,7 @@ def start_and_memory(overrides: Mapping[str, Any]) -> dict[str, float]:
     """Seconds from the command to the end of the first iteration, and the memory of one process.
 
     A second run of the same settings, so that the compilation cache is warm. The first env step
-    comes before the first row does; the time told is the later one.
+    comes before the first row does; the time reported is the later one.
     """
     values = dict(overrides)
     values["steps"] = resolve(values).rollout_steps * resolve(values).envs * 2
@@ -186,7 +186,7 @@ def start_and_memory(overrides: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _largest_worker(parent: int) -> int:
-    """KiB that the largest child of a process has held at its peak (Linux; elsewhere 0)."""
+    """KiB that the largest child of a process has used at its peak (Linux; elsewhere 0)."""
     largest = 0
     for place in Path("/proc").glob("[0-9]*"):
         try:
@@ -200,7 +200,7 @@ def _largest_worker(parent: int) -> int:
 
 
 def report(result: Mapping[str, Any]) -> list[str]:
-    """The figures as lines of text."""
+    """Returns the figures as lines of text."""
     rates, lines = result["rates"], []
     middle = {name: sorted(values)[len(values) // 2] for name, values in rates.items()}
     lines.append(

@@ -63,7 +63,7 @@ def bench_on_device(
         round_: dict[str, float] = {}
         for name, measure in measures.items():
             round_ |= measure()
-            say(f"round {number + 1} of {rounds}: {name}: {_told(round_, name)}")
+            say(f"round {number + 1} of {rounds}: {name}: {_text(round_, name)}")
         found.append(round_)
     rates = {name: [each[name] for each in found] for name in found[0] if name not in _APART}
     return {
@@ -118,7 +118,7 @@ def _on_device(overrides: Mapping[str, Any], iterations: int) -> dict[str, Any]:
     return {**overrides, "steps": min(steps, MAX_STEPS // config.max_env_steps_factor)}
 
 
-def _told(round_: Mapping[str, float], name: str) -> str:
+def _text(round_: Mapping[str, float], name: str) -> str:
     wanted = ("brax",) if name == "brax" else ("physics", "collect", "update", "whole")
     return ", ".join(f"{part} {round_[part]:,.0f}" for part in wanted) + " env steps/s"
 
@@ -133,7 +133,7 @@ def _elsewhere(module: str, overrides: Mapping[str, Any], iterations: int) -> di
 
 
 def device_name(config: Config) -> str:
-    """As the driver calls it."""
+    """Names the device as the driver calls it."""
     if config.device != "gpu":
         return "CPU"
     command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
@@ -161,7 +161,7 @@ def scale_on_device(
                 iterations,
             )
             found[axis].setdefault(value, []).append(each)
-            say(f"round {number + 1} of {rounds}: {value} {axis}: {_told(each, 'sauna')}")
+            say(f"round {number + 1} of {rounds}: {value} {axis}: {_text(each, 'sauna')}")
     return {
         "env": config.env,
         "arm": list(config.arm),
@@ -273,14 +273,14 @@ def _physics(env: Any, steps: int, state: Any, setting: Any) -> Any:
             action = jax.random.randint(key, (*number, 1), 0, int(space.n))
         else:
             action = jax.random.uniform(key, (*number, space.shape[0]), minval=-1.0, maxval=1.0)
-        told = jax.vmap(env.step)(inner, action)
-        return told.state, told.reward
+        after = jax.vmap(env.step)(inner, action)
+        return after.state, after.reward
 
     return jax.lax.scan(step, inner, jax.random.split(setting.keys.env, steps))
 
 
 def report_on_device(result: Mapping[str, Any]) -> list[str]:
-    """The figures as lines of text."""
+    """Returns the figures as lines of text."""
     rates = {name: median(values) for name, values in result["rates"].items()}
     lines = [
         f"{result['env']}, {', '.join(result['arm'])}, {result['members']} members of "

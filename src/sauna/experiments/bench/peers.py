@@ -38,7 +38,7 @@ def cache_folder() -> Path:
 
 
 def prepare(peer: str, say: Callable[[str], None]) -> Path:
-    """The Python interpreter of a peer's environment, made if it is not there.
+    """Returns the Python interpreter of a peer's environment, made if it is not there.
 
     Raises:
       BadInput: there is no such peer.
@@ -76,7 +76,7 @@ def _pip(python: Path, arguments: list[str]) -> str | None:
 def peer_rate(
     python: Path, script: Path | None, env: str, algorithm: str, processes: int, seconds: float
 ) -> float:
-    """Env steps per second, summed over `processes` trainings that run at the same time.
+    """Returns env steps per second, summed over `processes` trainings that run at the same time.
 
     Args:
       script: CleanRL's `ppo_continuous_action.py`, or None for Stable-Baselines3.
@@ -141,7 +141,7 @@ def _failed(errors: str, code: int) -> SaunaError:
 
 
 def versions(python: Path) -> dict[str, str]:
-    """Of what a peer's speed depends on."""
+    """Returns the versions of what a peer's speed depends on."""
     code = (
         "import importlib.metadata as m, json; "
         "names = {d.name for d in m.distributions()}; "

@@ -63,7 +63,7 @@ class Clock:
         pass
 
     def rate(self) -> float:
-        """Env steps per second of all members after the warm-up, to the last row."""
+        """Returns env steps per second of all members after the warm-up, to the last row."""
         warm = [entry for entry in self.seen if entry[1] >= WARM_UP - 1]
         if len(warm) < 2:
             raise SaunaError("too few iterations to measure a rate")
@@ -72,7 +72,7 @@ class Clock:
 
 
 def training_rate(settings: Mapping[str, Any]) -> float:
-    """Env steps per second of a whole training in a folder that is removed afterwards."""
+    """Returns env steps per second of a whole training in a folder that is removed afterwards."""
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder:
         run = runs.start({**settings, "out": os.path.join(folder, "run")}, clock)
@@ -81,7 +81,8 @@ def training_rate(settings: Mapping[str, Any]) -> float:
 
 
 def simulator(env: str) -> str | None:
-    """What steps an environment: `raw mj_step`, `ale-py alone`, or None where it is not known."""
+    """Returns what steps an environment: `raw mj_step`, `ale-py alone`, or None where it is not
+    known."""
     from sauna.envs.host.atari_envs import is_atari
     from sauna.envs.make import is_mujoco
 
@@ -115,7 +116,7 @@ def alternate(
 
 
 def ratio(rates: list[float], others: list[float]) -> dict[str, float]:
-    """Median, lowest and highest of the rounds' ratios."""
+    """Computes the median, lowest and highest of the rounds' ratios."""
     each = np.array(rates) / np.array(others)
     return {"median": float(np.median(each)), "low": float(each.min()), "high": float(each.max())}
 

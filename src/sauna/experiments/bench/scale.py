@@ -27,7 +27,7 @@ LABELS = {
 
 
 def settings_at(axis: str, value: int) -> dict[str, Any]:
-    """What a point changes in the settings; the batch of one update stays the same."""
+    """Returns what a point changes in the settings; the batch of one update stays the same."""
     if axis == "members":
         return {"seeds": value, "processes": 1}
     if axis == "envs":
@@ -40,7 +40,7 @@ def settings_at(axis: str, value: int) -> dict[str, Any]:
 def scale(
     overrides: Mapping[str, Any], rounds: int, say: Callable[[str], None]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Env steps per second at every point of each axis, all of them once per round.
+    """Returns env steps per second at every point of each axis, all of them once per round.
 
     Returns:
       `{axis: [{"value", "rate", "rates"}, ...]}`: the median of the rounds, and each of them.
@@ -77,7 +77,7 @@ def _rate(settings: Mapping[str, Any]) -> float:
 
 
 def draw(found: Mapping[str, list[dict[str, Any]]], title: str, path: Path) -> None:
-    """One panel per axis."""
+    """Draws one panel per axis."""
     from sauna.experiments.report.style import applied, save
 
     with applied():

@@ -1,26 +1,36 @@
-"""Episodes with a frozen policy and a frozen normaliser, and a video of one."""
+"""Episodes with a frozen policy and a frozen normaliser."""
 
 from __future__ import annotations
 
-import ctypes.util
 import json
-import os
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from sauna.envs.make import make_drawn_env, make_env
+from sauna.config.plugins import is_local, name_of, provide
+from sauna.config.settings import fields_with, parse
+from sauna.envs.host.answers import close
+from sauna.envs.make import make_env, one_name
+from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member, load_artifact
+from sauna.experiments.evaluate.play import Episode, Progress, play
+from sauna.experiments.evaluate.video import record_video
 from sauna.system import run_directory
-from sauna.system.errors import BadInput, SaunaError, one_line
-
-if TYPE_CHECKING:
-    from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.working_folder import kept_folder
 
 
+class VideoFailure(SaunaError):
+    """No video could be made; `result` holds what was played before."""
+
+    def __init__(self, message: str, result: dict[str, Any]) -> None:
+        super().__init__(message)
+        self.result = result
+
+
+@kept_folder()
 def evaluate(
     run: str | Path,
     *,
@@ -28,14 +38,19 @@ def evaluate(
     episodes: int = 10,
     deterministic: bool = False,
     seed: int = 0,
-    env: str | None = None,
+    env: Any = None,
+    env_kwargs: Mapping[str, Any] | str | None = None,
+    checkpoint: int | None = None,
+    max_steps: int = MAX_STEPS,
     video: bool = False,
+    trust: bool = False,
     say: Callable[[str], None] = print,
+    **parts: Any,
 ) -> dict[str, Any]:
     """Plays `episodes` episodes with each member.
 
-    All members on the run's own environment are written to `evaluation_MODE.json`; a part of them,
-    or another environment, is only returned.
+    All members at the newest checkpoint, on the run's own environment, are written to
+    `evaluation_MODE.json`; anything else is only returned.
 
     Args:
       run: the run directory.
@@ -43,74 +58,95 @@ def evaluate(
       deterministic: the distribution's mode; otherwise actions are sampled.
       seed: episodes are reset with seeds `seed`, `seed + 1`, ...
       env: another environment with the same spaces; default the run's.
-      video: also films the first member's first episode.
-      say: is told of checkpoints that cannot be trusted.
+      env_kwargs: keyword arguments of the environment: on the run's own, they change the run's.
+      checkpoint: the iteration of a kept checkpoint; default the newest good one.
+      max_steps: env steps after which an episode that has not ended is cut.
+      video: also records the first member's first episode.
+      trust: the code that the run names may run, even if another user named it.
+      say: is called with a line about checkpoints that cannot be trusted, progress, and episodes
+        that were cut.
+      **parts: those that were passed by value when the run started (`network`, ...).
 
     Returns:
       `{"mode", "env", "seed", "members": {name: {"returns", "lengths", "mean", ...}}}`.
 
     Raises:
-      BadInput: no such run or member, impossible numbers, or `env` has other spaces.
-      SaunaError: a video was asked for and the environment cannot render here.
+      BadInput: no such run, member or checkpoint, impossible numbers, or `env` has other spaces.
+      VideoFailure: a video was asked for and the environment cannot render here.
     """
-    run = Path(run)
-    if episodes < 1 or seed < 0:
-        raise BadInput("episodes: must be at least 1, and seed at least 0")
-    artifact = load_artifact(run, say)
+    run = Path.cwd() / run  # an environment may go elsewhere
+    if episodes < 1 or seed < 0 or max_steps < 1:
+        raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    artifact = load_artifact(run, say, checkpoint, trust=trust)
+    env = _provided(run, env, parts)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]
+    own = artifact.config.env
     mode = "deterministic" if deterministic else "sampled"
     result: dict[str, Any] = {
         "mode": mode,
-        "env": env or artifact.config.env,
+        "env": env or own,
         "seed": seed,
         "iteration": artifact.checkpoint.manifest["iteration"],
         "members": {},
     }
-    world = make_env(result["env"], _kwargs(artifact, env))
-    check_spaces(artifact, world)
+    kwargs = kwargs_of(artifact, env, env_kwargs)
+    if env_kwargs:
+        result["env_kwargs"] = kwargs
+    made = make_env(result["env"], kwargs)
+    check_spaces(artifact, made)
     from sauna.experiments.evaluate.policy import TrainedPolicy  # imports JAX, so after the checks
 
     for name in chosen:
-        policy = TrainedPolicy(artifact, name, world)
-        played = [play(policy, world, deterministic, seed + i) for i in range(episodes)]
+        policy = TrainedPolicy(artifact, name, made)
+        progress = Progress(name, episodes, say)
+        played = [
+            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
+            for i in range(episodes)
+        ]
         result["members"][name] = statistics(played)
-    world.close()
-    if env is None and member is None:
+        progress.say_cut(max_steps)
+    close(made)
+    if env is None and member is None and checkpoint is None and not env_kwargs:
         run_directory.write_json(run / f"evaluation_{mode}.json", result)
     if video:
-        result["video"] = str(film(run, artifact, chosen[0], env, deterministic, seed))
+        label = f"{chosen[0].replace('/', '-')}_{mode}" + f"_{checkpoint}" * (
+            checkpoint is not None
+        )
+        path = run / "videos" / f"{label}.mp4"
+        try:
+            record_video(
+                path, artifact, chosen[0], result["env"], kwargs, deterministic, seed, max_steps
+            )
+        except SaunaError as error:
+            raise VideoFailure(str(error), result) from error
+        result["video"] = str(path)
     return result
 
 
-def _kwargs(artifact: Artifact, env: str | None) -> dict[str, Any]:
-    return {} if env else json.loads(artifact.config.env_kwargs)
+def _provided(run: Path, env: Any, parts: Mapping[str, Any]) -> str | None:
+    """The name of another environment, if one is asked for; parts of the run are put in place."""
+    if env is not None and not isinstance(env, str):
+        if is_local(str(run_directory.read_config(run).get("config", {}).get("env"))):
+            parts, env = {**parts, "env": env}, None
+        else:
+            env = name_of(env)
+    rest = provide(run, parts, fields_with("plugin"))
+    if rest:
+        raise BadInput(f"unknown argument {next(iter(rest))!r}")
+    return env
 
 
-def play(
-    policy: TrainedPolicy,
-    env: Any,
-    deterministic: bool,
-    seed: int,
-    watch: Callable[[], None] = lambda: None,
-) -> tuple[float, int]:
-    """One episode; its return (raw rewards) and length in env steps."""
-    import jax
-
-    key = jax.random.key(seed)
-    observation, _ = env.reset(seed=seed)
-    watch()
-    return_, length, ended = 0.0, 0, False
-    while not ended:
-        step_key = None if deterministic else jax.random.fold_in(key, length)
-        action = policy(observation, deterministic=deterministic, key=step_key)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        return_, length, ended = return_ + float(reward), length + 1, terminated or truncated
-        watch()
-    return return_, length
+def kwargs_of(
+    artifact: Artifact, env: str | None, given: Mapping[str, Any] | str | None
+) -> dict[str, Any]:
+    """The keyword arguments of an environment: on the run's own, the run's and those given."""
+    own = env is None or one_name(env) == one_name(artifact.config.env)
+    changes = json.loads(parse("env_kwargs", given or {}))
+    return {**(json.loads(artifact.config.env_kwargs) if own else {}), **changes}
 
 
-def statistics(played: list[tuple[float, int]]) -> dict[str, Any]:
-    returns, lengths = [r for r, _ in played], [n for _, n in played]
+def statistics(played: list[Episode]) -> dict[str, Any]:
+    returns, lengths = [e.return_ for e in played], [e.length for e in played]
     return {
         "episodes": len(played),
         "mean": float(np.mean(returns)),
@@ -121,61 +157,23 @@ def statistics(played: list[tuple[float, int]]) -> dict[str, Any]:
         "length_mean": float(np.mean(lengths)),
         "length_min": min(lengths),
         "length_max": max(lengths),
+        "cut": sum(e.cut for e in played),
         "returns": returns,
         "lengths": lengths,
     }
 
 
-def film(
-    run: Path, artifact: Artifact, name: str, env: str | None, deterministic: bool, seed: int
-) -> Path:
-    """Films one episode to `videos/MEMBER_MODE.mp4`.
-
-    Raises:
-      SaunaError: the environment cannot render on this machine.
-    """
-    from sauna.experiments.evaluate.policy import TrainedPolicy
-
-    choose_renderer()
-    frames: list[np.ndarray] = []
-    try:
-        world = make_drawn_env(env or artifact.config.env, _kwargs(artifact, env))
-        policy = TrainedPolicy(artifact, name, world)
-        play(policy, world, deterministic, seed, lambda: frames.append(world.render()))
-    except SaunaError:
-        raise
-    except Exception as error:  # renderers fail in every way there is
-        raise SaunaError(f"video: {not_drawn(error)}") from error
-    if not frames or frames[0] is None:
-        raise SaunaError("video: the environment gives no pictures (render_mode rgb_array)")
-    import imageio.v3 as imageio
-
-    mode = "deterministic" if deterministic else "sampled"
-    path = run / "videos" / f"{name.replace('/', '-')}_{mode}.mp4"
-    path.parent.mkdir(exist_ok=True)
-    rate = int(world.metadata.get("render_fps", 30))
-    world.close()
-    with warnings.catch_warnings():
-        # ffmpeg is started by a fork that executes it at once; JAX warns of forks of any kind.
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        imageio.imwrite(path, np.stack(frames), fps=rate, macro_block_size=1)
-    return path
-
-
-def not_drawn(error: Exception) -> str:
-    """Why an environment cannot be drawn, in a line, and what may help where OpenGL is missing."""
-    text = str(error) if isinstance(error, SaunaError) else one_line(error)
-    missing = any(word in text for word in ("GL", "Mesa", "isplay"))
-    help = "; without a display MuJoCo needs libegl1 or libosmesa6" * missing
-    return f"the environment cannot be drawn here: {text}{help}"
-
-
-def choose_renderer() -> None:
-    """Without a display, lets MuJoCo draw with EGL or OSMesa, whichever is installed."""
-    if os.environ.get("DISPLAY") or os.environ.get("MUJOCO_GL"):
-        return
-    for library, name in (("EGL", "egl"), ("OSMesa", "osmesa")):
-        if ctypes.util.find_library(library):
-            os.environ["MUJOCO_GL"] = name
-            os.environ.setdefault("PYOPENGL_PLATFORM", name)
-            return
+def report(result: dict[str, Any]) -> list[str]:
+    """Says an evaluation in lines."""
+    lines = [
+        f"{result['env']}, {result['mode']} actions, frozen normaliser, "
+        f"checkpoint of iteration {result['iteration']}"
+    ]
+    for name, row in result["members"].items():
+        lines.append(
+            f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
+            f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
+            f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
+            f"{row['episodes']} episodes"
+        )
+    return lines

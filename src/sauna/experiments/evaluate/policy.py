@@ -6,14 +6,15 @@ import json
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
+from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
 from sauna.envs.spaces import action_writer, observation_reader
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member
+from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.loop.member_state import fitting, flat_params, under
 
 CHUNK = 512  # observations of one call of `predict`: one compiled shape, and bounded memory
@@ -39,14 +40,15 @@ class TrainedPolicy:
         env = env or make_env(self.config.env, json.loads(self.config.env_kwargs))
         check_spaces(artifact, env)
         self._read = observation_reader(env.observation_space)
-        self._write = action_writer(env.action_space)
+        self._write = action_writer(env.action_space, self.config.rescale_actions)
         if made:
-            env.close()
+            close(env)
         own = under(self.name + "/", artifact.checkpoint.arrays)
+        if len(self.config.hidden) > len(own):  # each layer has arrays of its own
+            raise BadCheckpoint(f"{artifact.checkpoint.path}: it lacks layers that its config has")
         self._policy: Policy = make_policy(self.config, artifact.spaces)
         example = jax.eval_shape(self._policy.init, jax.random.key(0))
-        zeros = jnp.zeros(example.shape, example.dtype)
-        self._params = flat_params(self._policy, zeros, under("params/", own))
+        self._params = flat_params(self._policy, example, under("params/", own))
         if self.config.normalize_observations:
             size = artifact.spaces.observation_shape
             parts = {"mean": size, "variance": size, "count": (1,)}
@@ -68,7 +70,7 @@ class TrainedPolicy:
         return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
 
     def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
-        """The action for one raw observation, clipped as the environment wants it.
+        """The action for one raw observation, clipped or stretched as the environment wants it.
 
         Sampled actions need a JAX `key`; the normaliser is never updated.
         """

@@ -2,7 +2,7 @@
 
 The decisions are the filter's own functions, run as the collector runs them: the filter starts
 anew where a rollout begins, and a rollout ends with its last kept step (or where it may try no
-further one). Only the policy stands still, where training would update it between rollouts.
+further one). Only the policy does not change, where training would update it between rollouts.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sauna.algorithm.learner.samples import advantages_over_all, advantages_over
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.selection.history import History, median
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.selection.vex_filter import EPSILON, Held, held_edge
+from sauna.algorithm.selection.vex_filter import EPSILON, RateState, rate_edge
 from sauna.algorithm.types import Array, Hypers, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 
@@ -27,19 +27,21 @@ class Decisions(NamedTuple):
     """Of one environment's `L` env steps.
 
     Median and edge are NaN where there are no earlier predictions, and for other filters than
-    `sauna`. An edge is infinite where a held keep rate drops whatever comes.
+    `sauna`. An edge is infinite where a target keep rate drops whatever comes.
     """
 
     prediction: np.ndarray  # [L] x of eq. 7: the head's Vex, for a joint decision its mean
-    median: np.ndarray  # [L] of the earlier predictions (of |Vex| where a keep rate is held)
+    median: np.ndarray  # [L] of the earlier predictions (of |Vex| if there is a target keep rate)
     edge: np.ndarray  # [L] below which |x| is dropped
     keep: np.ndarray  # [L] bool
     rollouts: list[int]  # the steps at which a rollout begins
 
 
 def environments(config: Config) -> int:
-    """How many environments a decision looks at: of the package's filters, only the joint one
-    looks at more than its own; a user's filter may."""
+    """Returns how many environments a decision looks at.
+
+    Of the package's filters, only the joint one looks at more than its own; a user's filter may.
+    """
     alone = config.filter in ("none", "random-drop") or (
         config.filter == "sauna" and config.decision == "env"
     )
@@ -47,15 +49,15 @@ def environments(config: Config) -> int:
 
 
 def standards(config: Config, state: Any, hypers: Hypers) -> tuple[Array, Array]:
-    """What the next prediction is held against: the median and the edge, `[N]` or `[1]` each."""
+    """Returns what the next prediction is compared with: median and edge, `[N]` or `[1]` each."""
     if config.filter != "sauna":
         return jnp.full(1, jnp.nan), jnp.full(1, jnp.nan)
-    history = state.history if isinstance(state, Held) else state
+    history = state.history if isinstance(state, RateState) else state
     assert isinstance(history, History)
     middle = median(history)
     edge = hypers.threshold * (jnp.abs(middle) + EPSILON)
-    if isinstance(state, Held):
-        least = held_edge(state, config.keep_rate_target)
+    if isinstance(state, RateState):
+        least = rate_edge(state, config.keep_rate_target)
         edge = jnp.maximum(least, 0.0)
     known = history.number > 0
     return tuple(jnp.atleast_1d(jnp.where(known, x, jnp.nan)) for x in (middle, edge))  # type: ignore[return-value]
@@ -70,7 +72,7 @@ def trace(
     key: Array,
     hypers: Hypers,
 ) -> tuple[Array, tuple[Array, Array]]:
-    """The mask `[S, N]` of `rollout.program.decide`, and the `standards` before each step.
+    """Returns the mask `[S, N]` of `rollout.program.decide`, and the `standards` before each step.
 
     Args:
       steps: fields `[S, N, ...]`.
@@ -87,7 +89,7 @@ def trace(
 
 
 def decide(config: Config, scored: ScoredStep, key: Any, hypers: Hypers) -> Decisions:
-    """Rollout after rollout; what is kept is environment 0's.
+    """Decides rollout after rollout; what is kept is environment 0's.
 
     Args:
       config: the member's own.
@@ -95,22 +97,22 @@ def decide(config: Config, scored: ScoredStep, key: Any, hypers: Hypers) -> Deci
       key: rollout r draws from `fold_in(key, r)`.
     """
     vex: Any = scored.vex
-    filter, steps, room = make_filter(config), len(vex), capacity(config)
+    filter, steps, most = make_filter(config), len(vex), capacity(config)
     joint = config.filter == "sauna" and config.decision == "joint"
     prediction = vex.mean(1) if joint else vex[:, 0]
     if filter is None:
         nothing = np.full(steps, np.nan)
         return Decisions(
-            prediction, nothing, nothing, np.ones(steps, bool), list(range(0, steps, room))
+            prediction, nothing, nothing, np.ones(steps, bool), list(range(0, steps, most))
         )
     before, keep = np.zeros((2, steps)), np.zeros(steps, bool)
     rollouts: list[int] = []
     start = 0
-    longest = min(room, steps)
+    longest = min(most, steps)
     while start < steps:
         rows = ScoredStep(*(_stretch(x, start, longest) for x in scored))
         rollout_key = jax.random.fold_in(key, len(rollouts))
-        first = filter.init(vex.shape[1], room)
+        first = filter.init(vex.shape[1], most)
         mask, standard = trace(config, filter, first, rows, rollout_key, hypers)
         own = np.asarray(mask)[:, 0]
         full = np.flatnonzero(np.cumsum(own) == config.rollout_steps)
@@ -131,7 +133,7 @@ def _stretch(x: np.ndarray, start: int, length: int) -> np.ndarray:
 
 
 def advantages(config: Config, stream: Rollout, rollouts: list[int], hypers: Hypers) -> np.ndarray:
-    """GAE `[L]` of a stream `[L, 1]`, within each rollout as the run computes it.
+    """Computes GAE `[L]` of a stream `[L, 1]`, within each rollout as the run computes it.
 
     NaN where the run computes none: with `gae_over=kept`, on dropped steps.
     """

@@ -15,12 +15,16 @@ from sauna.algorithm.policy.normalize import Moments, scale_rewards
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.evaluate.video import frames_per_second
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
-from sauna.experiments.inspect.recording import Played, clock, open_world, play_episodes, play_steps
+from sauna.experiments.inspect.recording import Played, open_env, play_episodes, play_steps
 from sauna.system import run_directory
+from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under
 
@@ -56,28 +60,31 @@ def examine(
     episodes: int,
     deterministic: bool,
     seed: int,
-    pictures: bool,
+    frames: bool,
     say: Callable[[str], None],
+    max_steps: int = MAX_STEPS,
 ) -> Inspection:
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
     everyone = artifact.run.members
-    member = next(one for one in everyone if one.name == name)
+    member = next((one for one in everyone if one.name == name), None)
+    if member is None:
+        raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
     config, iteration = member.config, int(manifest["iteration"])
     kwargs = json.loads(config.env_kwargs)
-    world, drawer = open_world(config.env, kwargs, pictures, say)
-    policy = TrainedPolicy(artifact, name, world)
-    played = play_episodes(policy, world, episodes, deterministic, seed, drawer)
-    steps_per_second = clock(world)
-    world.close()
+    env, drawer = open_env(config.env, kwargs, frames, say)
+    policy = TrainedPolicy(artifact, name, env)
+    played = play_episodes(policy, env, episodes, deterministic, seed, drawer, max_steps, say)
+    steps_per_second = frames_per_second(env)
+    close(env)
     own = under(name + "/", artifact.checkpoint.arrays)
     hypers = hypers_of(run, config, everyone.index(member), iteration, own)
     steps, number = len(played.reward), environments(config)
     seen = [played.observation]
     for n in range(1, number):
-        world = make_env(config.env, kwargs)
-        seen.append(play_steps(policy, world, steps, deterministic, seed, n))
-        world.close()
+        env = make_env(config.env, kwargs)
+        seen.append(play_steps(policy, env, steps, deterministic, seed, n))
+        close(env)
     value, own_vex = policy.predict(played.observation)
     vex = np.stack([own_vex, *(policy.predict(x)[1] for x in seen[1:])], 1)
     key = jax.random.fold_in(member_keys(member.seed).filter, iteration)
@@ -117,14 +124,15 @@ def examine(
 def hypers_of(
     run: Path, config: Config, index: int, iteration: int, own: Mapping[str, np.ndarray]
 ) -> Hypers:
-    """The member's traced settings, at the checkpoint's iteration; `own` are its arrays."""
+    """Returns the member's traced settings, at the checkpoint's iteration; `own` are its arrays."""
     rates = run_directory.read_config(run).get("drop_rates") or []
     counters = Counters.from_arrays(own)
     return hypers_now(config, rates[index] if rates else [], counters, iteration)
 
 
 def scaled(config: Config, own: Mapping[str, np.ndarray], reward: np.ndarray) -> np.ndarray:
-    """Raw rewards `[L]` as the value function learns them, with the frozen reward normaliser."""
+    """Returns raw rewards `[L]` as the value function learns them, with the frozen reward
+    normaliser."""
     if config.sign_rewards:
         reward = np.sign(reward)
     if not config.normalize_rewards:
@@ -157,7 +165,8 @@ def _stream(
 
 
 def pixel_stride(observation: np.ndarray) -> int:
-    """Of pictures `[L, H, W, C]`, each how manyth row and column their components are taken of."""
+    """Returns n for images `[L, H, W, C]` whose components are taken of each n-th row and
+    column."""
     if observation.ndim < 4:
         return 1
     return max(1, math.ceil(math.sqrt(observation.size / LARGEST)))
@@ -166,9 +175,10 @@ def pixel_stride(observation: np.ndarray) -> int:
 def principal_components(
     observation: np.ndarray,
 ) -> tuple[np.ndarray | None, list[float]]:
-    """The first two principal components `[L, 2]` of `[L, *obs]`, and their shares of variance.
+    """Returns the first two principal components `[L, 2]` of `[L, *obs]`, and their shares of
+    variance.
 
-    Of each component the sign is such that its largest loading is positive. Of pictures only so
+    Of each component the sign is such that its largest loading is positive. Of frames only so
     many pixels are looked at that the matrix stays small; None where it is too large all the same.
     """
     every = pixel_stride(observation)

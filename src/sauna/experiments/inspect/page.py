@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import base64
 import shlex
-from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sauna.algorithm.rollout.collected import capacity
 from sauna.experiments.inspect.inspection import Inspection, pixel_stride
-from sauna.experiments.report.page import asset, filled, rounded
-from sauna.experiments.report.tables import DOT, table
+from sauna.experiments.report.page import asset, render, rounded
 
 SETTINGS = (
     "filter",
@@ -39,31 +38,28 @@ SETTINGS = (
 
 
 def make_page(found: Inspection, run: Path) -> str:
-    """The page as text."""
+    """Renders the page as text."""
     config = found.member.config
-    return filled(
+    return render(
         "inspect",
-        page_data(found),
         asset("inspect.css"),
-        title=escape(f"{config.env}, {found.member.name}"),
+        asset("draw.js") + asset("inspect.js"),
+        page_data(found),
+        title=f"{config.env}, {found.member.name}",
         scope=scope(found),
-        notes="".join(f"<p>{escape(text)}</p>" for text in notes(found)),
-        picture='<img id="picture" alt="The environment at this step">'
-        if found.played.pictures
-        else "",
+        notes=notes(found),
+        frames=bool(found.played.frames),
         states=states(found),
+        scatter=found.points is not None,
         meaning=meaning(found),
-        settings=table(
-            ("Setting", "Value"),
-            [(name, [escape(str(getattr(config, name)))]) for name in SETTINGS],
-            name="Settings",
-        ),
-        command=escape(command(found, run)),
+        settings=[("Setting", "Value"), *((n, str(getattr(config, n))) for n in SETTINGS)],
+        command=command(found, run),
     )
 
 
 def compares(found: Inspection) -> bool:
-    """Whether the head's prediction is held against an edge: a rule that can drop steps."""
+    """Returns whether the head's prediction is compared with an edge: a rule that can drop
+    steps."""
     return bool(found.hypers.threshold > 0) and bool(np.isfinite(found.decisions.edge).any())
 
 
@@ -72,7 +68,8 @@ def shows_vex(found: Inspection) -> bool:
 
 
 def page_data(found: Inspection) -> dict[str, Any]:
-    """What the script draws: a value per env step in every list of `series` and of the panels."""
+    """Returns what the script draws: a value per env step in every list of `series` and of the
+    panels."""
     played, decisions, config = found.played, found.decisions, found.member.config
     value, advantage = found.value.astype(float), found.advantage
     scaled = " (normalised)" if config.normalize_rewards else ""
@@ -109,20 +106,20 @@ def page_data(found: Inspection) -> dict[str, Any]:
         "series": {name: rounded(values.tolist()) for name, (_, values) in lines.items()},
         "panels": panels,
         "points": [] if found.points is None else rounded(found.points.T.tolist()),
-        "pictures": {
-            "rows": [row for row, _ in played.pictures],
-            "images": [base64.b64encode(data).decode() for _, data in played.pictures],
+        "frames": {
+            "rows": [row for row, _ in played.frames],
+            "images": [base64.b64encode(data).decode() for _, data in played.frames],
         },
     }
 
 
 def scope(found: Inspection) -> str:
-    """What was played, in one line."""
+    """Returns what was played, in one line."""
     played, episodes = found.played, len(found.played.returns)
     returns = ", ".join(f"{value:,.1f}" for value in played.returns[:5])
     more = ", ..." if episodes > 5 else ""
     dropped = int((~found.decisions.keep).sum())
-    return f" {DOT} ".join(
+    return " \N{MIDDLE DOT} ".join(
         [
             f"{found.mode} actions",
             f"trained for {found.env_steps:,} env steps",
@@ -133,7 +130,7 @@ def scope(found: Inspection) -> str:
 
 
 def notes(found: Inspection) -> list[str]:
-    """What a reader must know before the page is looked at."""
+    """Returns what a reader must know before the page is looked at."""
     config, arm, kept = found.member.config, found.member.arm, float(found.decisions.keep.mean())
     said = []
     if not shows_vex(found):
@@ -164,20 +161,19 @@ def notes(found: Inspection) -> list[str]:
         said.append(
             f"Decisions look at {found.environments} environments together; environment 0 is shown."
         )
-    if not found.played.pictures:
-        said.append("There are no pictures.")
+    if not found.played.frames:
+        said.append("There are no frames.")
     return said
 
 
 def states(found: Inspection) -> str:
-    """What the scatter shows, in words."""
+    """Returns what the scatter shows, in words."""
     if found.points is None:
-        return "<p>Left out: the observations are too large for it.</p>"
+        return "Left out: the observations are too large for it."
     shares = " and ".join(f"{100 * share:.0f}%" for share in found.shares)
     return (
-        f"<p>What the network saw at each step, along its first two principal components "
-        f"({shares} of the variance{_thinned(found)}). Point at a state to go to its step.</p>"
-        f'<div id="scatter"></div>'
+        f"What the network saw at each step, along its first two principal components "
+        f"({shares} of the variance{_thinned(found)}). Point at a state to go to its step."
     )
 
 
@@ -186,8 +182,8 @@ def _thinned(found: Inspection) -> str:
     return f", of one row and column of pixels in {every}" if every > 1 else ""
 
 
-def meaning(found: Inspection) -> str:
-    """What the lines are, and their units."""
+def meaning(found: Inspection) -> list[Markup]:
+    """Returns what the lines are, and their units; no value comes from a run but numbers."""
     config = found.member.config
     said = []
     if shows_vex(found):
@@ -197,17 +193,17 @@ def meaning(found: Inspection) -> str:
             + (f", mean over {config.envs} environments." if several else ".")
         )
     if compares(found):
-        held = config.keep_rate_target > 0
+        has_target = config.keep_rate_target > 0
         rule = (
             f"below the quantile of the rollout's earlier ones that is moved at every step to keep "
             f"{config.keep_rate_target:g} of all"
-            if held
+            if has_target
             else f"below {float(found.hypers.threshold):g} times |median|"
         )
         said.append(
             f"<b>Running median</b>: of the rollout's earlier predictions "
             f"({'all of them' if config.history == 'all' else 'those of kept steps'}"
-            f"{', without their sign' * held}). A step is <b>dropped</b> where |Vex| is {rule}: "
+            f"{', without their sign' * has_target}). A step is <b>dropped</b> if |Vex| is {rule}, "
             f"inside the band. A rollout ends {_end_of_rollout(found)}; the next one begins with "
             f"an empty history (dashed upright line)."
         )
@@ -230,7 +226,7 @@ def meaning(found: Inspection) -> str:
     )
     if len(found.played.returns) > 1:
         said.append("Solid upright lines: a new episode.")
-    return "".join(f"<p>{text}</p>" for text in said)
+    return [Markup(text) for text in said]
 
 
 def _end_of_rollout(found: Inspection) -> str:

@@ -1,1 +1,5 @@
-"""Measurements of trained members at their checkpoints; see `measure/__main__.py`."""
+"""Measurements of trained members at their checkpoints: each is one `Measurement`."""
+
+from sauna.experiments.measure.measurement import Measurement
+
+__all__ = ["Measurement"]

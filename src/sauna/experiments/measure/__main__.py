@@ -2,11 +2,11 @@
 
     python -m sauna.experiments.measure < settings
 
-The first line of standard input holds, as JSON, what is measured (`noise`, `dial`, `torso`), the
-run, the member's name, the checkpoints' numbers, and the file that each measurement is written to;
-for `dial` also the run, the member and the checkpoint whose normaliser is the scale. What is
-written is whole, so that a process that is stopped loses only the checkpoint it was at. The end of
-standard input means that whoever asked is gone: the process ends. Mistakes are told as JSON lines.
+The first line of standard input holds, as JSON: `compute` (the `module:function` of a
+`Measurement`), the run, the member's name, the checkpoints' numbers, and the file that each result
+is written to; `scale` is the run, the member and the checkpoint of the scale, or null. Each file is
+written whole, so that a process that is stopped loses only the checkpoint it was at. It ends at the
+end of standard input. Mistakes are reported as JSON lines.
 """
 
 from __future__ import annotations
@@ -18,40 +18,34 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from sauna.config.plugins import import_name
 from sauna.system import run_directory
 from sauna.system.errors import SaunaError
 from sauna.system.jax_setup import configure_jax
 
 
-def measure(given: dict[str, Any]) -> None:
-    """Makes every measurement whose file is not there yet."""
+def measure(settings: dict[str, Any]) -> None:
+    """Computes every measurement whose file is not there yet."""
     configure_jax()
-    from sauna.experiments.evaluate.artifact import load_artifact
-    from sauna.experiments.measure import coverage, noise, posture
-    from sauna.experiments.measure.streams import load_standing
+    from sauna.experiments.measure.streams import load_snapshot
 
-    scale: Any = given.get("scale")
-    scale = scale and load_standing(Path(scale["run"]), scale["member"], scale["iteration"])
-    for iteration, file in zip(given["iterations"], given["files"], strict=True):
+    compute = import_name("measure", settings["compute"])
+    scale: Any = settings.get("scale")
+    scale = scale and load_snapshot(Path(scale["run"]), scale["member"], scale["iteration"])
+    for iteration, file in zip(settings["iterations"], settings["files"], strict=True):
         if Path(file).exists():
             continue
-        standing = load_standing(Path(given["run"]), given["member"], iteration)
-        if given["what"] == "torso":
-            artifact = load_artifact(Path(given["run"]), iteration=iteration)
-            found = posture.measure(artifact, given["member"], Path(file).with_suffix(".png"))
-        elif given["what"] == "noise":
-            found = noise.measure(standing)
-        else:
-            found = coverage.measure(standing, scale)
-        place = {"iteration": iteration, "env_steps": standing.env_steps}
+        snapshot = load_snapshot(Path(settings["run"]), settings["member"], iteration)
+        found = compute(snapshot, scale, Path(file))
+        place = {"iteration": iteration, "env_steps": snapshot.env_steps}
         run_directory.write_json(Path(file), {**place, **found})
 
 
 def main() -> int:
-    given = json.loads(sys.stdin.readline())
+    settings = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_our_parent, daemon=True).start()
     try:
-        measure(given)
+        measure(settings)
     except SaunaError as error:
         print(json.dumps({"error": str(error)}), flush=True)
         print(error, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""How widely a member ranges at one checkpoint, and at random: what `study dial` measures.
+"""How widely a member ranges at one checkpoint, and at random: the measurement `coverage`.
 
 State coverage is the differential entropy of the observations that the policy of the checkpoint
 visits, acting as in training, by its distances to the nearest neighbours (Kozachenko and Leonenko
@@ -15,12 +15,13 @@ values.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy
 
-from sauna.experiments.measure.streams import Standing, fresh_streams
+from sauna.experiments.measure.streams import MemberSnapshot, fresh_streams
 
 STREAMS = 8
 STEPS = 2048  # env steps of each env in a stream, at least
@@ -28,14 +29,15 @@ EVERY = 8  # env steps between two observations that are counted
 NEIGHBOUR = 5  # K
 
 
-def measure(standing: Standing, scale: Standing) -> dict[str, Any]:
-    """State coverage at a checkpoint, as JSON values.
+def compute(snapshot: MemberSnapshot, scale: MemberSnapshot, file: Path) -> dict[str, Any]:
+    """Measures the state coverage at a checkpoint, in nats, as JSON values.
 
     Args:
       scale: the member whose normaliser, as it was there, scales the observations.
+      file: not read.
     """
-    steps = standing.config.rollout_steps
-    fresh = fresh_streams(standing, STREAMS, -(-STEPS // steps), limit=steps)
+    steps = snapshot.config.rollout_steps
+    fresh = fresh_streams(snapshot, STREAMS, -(-STEPS // steps), limit=steps)
     mean, variance = (scale.arrays[f"observation_moments/{n}"] for n in ("mean", "variance"))
     seen = np.concatenate([stream.seen[::EVERY] for stream in fresh.streams])
     return {
@@ -45,7 +47,7 @@ def measure(standing: Standing, scale: Standing) -> dict[str, Any]:
 
 
 def particle_entropy(points: np.ndarray) -> float:
-    """Entropy in nats of the density that `points` `[N, D]` are drawn from."""
+    """Computes the entropy in nats of the density that `points` `[N, D]` are drawn from."""
     number, size = points.shape
     distance = scipy.spatial.cKDTree(points).query(points, NEIGHBOUR + 1)[0][:, -1]
     log_ball = 0.5 * size * math.log(math.pi) - scipy.special.gammaln(0.5 * size + 1)

@@ -1,31 +1,35 @@
-"""Is the threshold a dial between exploration and exploitation? What `sauna study dial` says of it.
+"""The measurement `coverage`: does the threshold trade exploration for exploitation?
 
-Three things are set against the threshold: the policy's entropy (mean over training), its state
-coverage (mean over the checkpoints) and the final return, each one number per member. Whether one
-of them follows a constant threshold is asked by rank correlation over members; its p value is that
-of dealing the members' thresholds out at random, corrected by Holm's method for the three
-quantities of a task. A filter that drops more also updates less often in the same env steps: arms
-that drop as much by coin say how much of an effect that is. A coin's member repeats the drop rates
-of one member of the filter, so these are compared pair by pair, by Student's t.
+Three things are compared with the threshold in a sweep of it: the policy's entropy (mean over
+training), its state coverage (mean over the checkpoints) and the final return, each one number per
+member. Whether one of them follows a constant threshold is tested by rank correlation over members;
+its p value is that of permuting the members' thresholds, corrected by Holm's method for the three
+quantities of a task. A filter that drops more also updates less often in the same env steps: a
+matched random control, which drops as much, shows how much of an effect that is. A control's member
+repeats the drop rates of one member of the filter, so these are compared pair by pair, by
+Student's t.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.measure.noise_report import shown
 from sauna.experiments.report import style
-from sauna.experiments.report.figures import Extra, Line, Panel, Plot
-from sauna.experiments.report.tables import table
+from sauna.experiments.report.figures import Line, Panel, Plot, Section
 from sauna.experiments.statistics import ALPHA, SEED, Estimate, holm, mean_interval
+from sauna.system.errors import BadInput
 
-TITLE = "Is the threshold a dial between exploration and exploitation?"
-DEALS = 10_000
+TITLE = "Does the threshold trade exploration for exploitation?"
+PERMUTATIONS = 10_000
 # key of a member's number, what it is called, title, caption
 QUANTITIES = (
     ("keep_rate", "keep rate", "Keep rate", "Share of all env steps that updates learned from."),
@@ -43,41 +47,77 @@ ASKED = ("entropy", "coverage", "final_return")
 ABOUT = (
     "Against the threshold: keep rate, entropy of the policy, coverage of states, return. Of arms "
     "whose threshold moves its median over training is shown. Rank correlations are over members "
-    "of arms with a constant threshold, p by dealing their thresholds out at random, after Holm's "
-    "correction for the three quantities of a task. Fewer kept steps are also fewer updates in the "
-    "same env steps: arms that drop as much by coin show what that alone does. Differences from a "
-    "coin are means over pairs of members with the same drop rates; in brackets 95%, not corrected "
-    "for their number."
+    "of arms with a constant threshold, p by permuting their thresholds, after Holm's correction "
+    "for the three quantities of a task. Fewer kept steps are also fewer updates in the "
+    "same env steps: matched random controls show what that alone does. Differences from a "
+    "control are means over pairs of members with the same drop rates; in brackets 95%, not "
+    "corrected for their number."
 )
 LOOKS = {
     "constant": "sauna",
     "scheduled": "vex-head",
-    "held keep rate": "ppo",
-    "coin, dropping as much": "random-drop",
+    "target keep rate": "ppo",
+    "matched random control": "random-drop",
 }
 
 
 class Mark(NamedTuple):
-    """One arm on one task: where it stands, and its members' numbers."""
+    """One arm on one task: its threshold, and its members' numbers."""
 
     kind: str  # of `LOOKS`
     label: str
-    threshold: float  # of a coin, that of the arm whose rates it repeats
+    threshold: float  # of a control, that of the arm whose rates it repeats
     seeds: int  # that the arm has, trained and measured or not
     members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
-    drops_like: str | None = None  # of a coin, the arm whose drop rates it repeats
+    drops_like: str | None = None  # of a control, the arm whose drop rates it repeats
 
 
-def extra(measured: Mapping[str, Any]) -> Extra:
-    """The section and the figures that the study's page gets."""
-    head, *rows = text_table(measured)
-    html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(
-        head,
-        [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
-        name="Threshold, exploration and return",
+def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
+    """Reports on all results in a section of the study's page; `folder` is not read."""
+    return Section(
+        TITLE,
+        verdicts(measured),
+        ABOUT,
+        text_table(measured),
+        "Threshold, exploration and return",
+        plots(measured),
+        looks(),
+        answer=" ".join(
+            _verdict(task, found).split(" With a ")[0]
+            for task in tasks_of(measured)
+            if (found := marks(measured, task))
+        ),
     )
-    return Extra(TITLE, html, plots(measured), looks())
+
+
+def check(configs: Sequence[Config]) -> None:
+    """Refuses arms without a threshold or without a normaliser of observations.
+
+    Raises:
+      BadInput
+    """
+    for config in configs:
+        is_control = config.filter == "random-drop" and config.drop_rate_from
+        if config.filter != "sauna" and not is_control:
+            raise BadInput(
+                'study: measure = "coverage" is of arms that have a threshold, and of matched '
+                f"random controls, not of {', '.join(config.arm)}"
+            )
+        if not config.normalize_observations:
+            raise BadInput("normalize_observations: coverage takes its scale from the normaliser")
+
+
+def check_spaces(config: Config, spaces: Spaces) -> None:
+    """Refuses an environment whose observations have no normaliser.
+
+    Raises:
+      BadInput
+    """
+    if not config.normalize_observations:
+        raise BadInput(
+            "measure: coverage takes its scale from the normaliser of observations, which "
+            f"{config.env} does not have"
+        )
 
 
 def looks() -> dict[str, style.Look]:
@@ -85,7 +125,7 @@ def looks() -> dict[str, style.Look]:
 
 
 def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
-    """Every arm of a task whose threshold is known, in the order of the study.
+    """Returns every arm of a task whose threshold is known, in the order of the study.
 
     Of members that are measured: all of an arm's numbers are of the same ones.
     """
@@ -102,8 +142,8 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
             for key, *_ in QUANTITIES
         }
         kind = _kind(cell)
-        stands_for = cell["rates_of"] if kind.startswith("coin") else cell["label"]
-        threshold = thresholds.get(stands_for)
+        is_control = kind == "matched random control"
+        threshold = thresholds.get(cell["rates_of"] if is_control else cell["label"])
         if threshold is not None:
             found.append(
                 Mark(kind, cell["label"], threshold, cell["seeds"], numbers, cell["rates_of"])
@@ -122,9 +162,9 @@ def _threshold(cell: Mapping[str, Any]) -> float | None:
 def _kind(cell: Mapping[str, Any]) -> str:
     config = cell["config"]
     if cell["arm"] == "random-drop":
-        return "coin, dropping as much"
+        return "matched random control"
     if config["keep_rate_target"]:
-        return "held keep rate"
+        return "target keep rate"
     return "constant" if config["threshold_schedule"] == "constant" else "scheduled"
 
 
@@ -140,7 +180,7 @@ def tasks_of(measured: Mapping[str, Any]) -> list[str]:
 
 
 def over_members(mark: Mark, key: str) -> Estimate:
-    """Mean over members, and Student's t interval."""
+    """Computes the mean over members, and Student's t interval."""
     values = np.array([value for _, value in mark.members[key]])
     if len(values) < 2:
         return Estimate(float(values[0]) if len(values) else None, None, None)
@@ -148,7 +188,7 @@ def over_members(mark: Mark, key: str) -> Estimate:
 
 
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
-    """The head, and a row for each task and arm."""
+    """Returns the head, and a row for each task and arm."""
     names = [title for _, _, title, _ in QUANTITIES]
     rows = [["Task", "Arm", "Members", "Threshold", *names]]
     for task in tasks_of(measured):
@@ -160,7 +200,8 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
 
 
 def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | None:
-    """Rank correlation with a constant threshold, its p value, and the number of members.
+    """Computes the rank correlation with a constant threshold, its p value, and the number of
+    members.
 
     None where there are fewer than three thresholds. What is the same for all follows nothing.
     """
@@ -175,55 +216,55 @@ def correlation(found: Sequence[Mark], key: str) -> tuple[float, float, int] | N
     x, y = x - x.mean(), y - y.mean()
     rho = float(x @ y / np.sqrt((x @ x) * (y @ y)))
     random = np.random.default_rng(SEED)
-    dealt = np.abs(random.permuted(np.tile(x, (DEALS, 1)), axis=1) @ y)
-    p = (1 + int((dealt >= abs(x @ y) * (1 - 1e-12)).sum())) / (1 + DEALS)
+    permuted = np.abs(random.permuted(np.tile(x, (PERMUTATIONS, 1)), axis=1) @ y)
+    p = (1 + int((permuted >= abs(x @ y) * (1 - 1e-12)).sum())) / (1 + PERMUTATIONS)
     return rho, p, len(pairs)
 
 
 def verdicts(measured: Mapping[str, Any]) -> list[str]:
-    """The answer for each task, in sentences that claim no more than their tests."""
+    """Answers for each task in sentences that claim no more than their tests."""
     return [
         said
         for task in tasks_of(measured)
         if (found := marks(measured, task))
-        for said in (_verdict(task, found), *_beside_coins(task, found))
+        for said in (_verdict(task, found), *_beside_controls(task, found))
     ]
 
 
-def beside_coin(arm: Mark, coin: Mark, key: str) -> Estimate:
-    """Mean over the seeds that both have of arm minus coin, and its interval."""
-    own, other = dict(arm.members[key]), dict(coin.members[key])
+def beside_control(arm: Mark, control: Mark, key: str) -> Estimate:
+    """Estimates the mean of arm minus control over the seeds that both have, and its interval."""
+    own, other = dict(arm.members[key]), dict(control.members[key])
     pairs = [(seed, own[seed] - other[seed]) for seed in own if seed in other]
     return over_members(arm._replace(members={key: pairs}), key)
 
 
-def _beside_coins(task: str, found: Sequence[Mark]) -> Iterator[str]:
-    """Whether an arm does what a coin that drops as much does as well: a sentence for each coin."""
+def _beside_controls(task: str, found: Sequence[Mark]) -> Iterator[str]:
+    """Compares each arm with its matched random control: a sentence for each control."""
     arms = {mark.label: mark for mark in found}
-    for coin in found:
-        if coin.drops_like not in arms:
+    for control in found:
+        if control.drops_like not in arms:
             continue
         pairs = len(
-            {seed for seed, _ in arms[coin.drops_like].members["coverage"]}
-            & {seed for seed, _ in coin.members["coverage"]}
+            {seed for seed, _ in arms[control.drops_like].members["coverage"]}
+            & {seed for seed, _ in control.members["coverage"]}
         )
         if pairs < 2:
             yield (
-                f"{task}: threshold {coin.drops_like} and a coin that drops as much have too "
+                f"{task}: threshold {control.drops_like} and its matched random control have too "
                 f"few pairs yet."
             )
             continue
         said, apart = [], []
         for key, name, *_ in QUANTITIES:
             if key in ASKED:
-                value, low, high = beside_coin(arms[coin.drops_like], coin, key)
+                value, low, high = beside_control(arms[control.drops_like], control, key)
                 said.append(f"{name} {shown(Estimate(value, low, high))}")
                 if low is not None and high is not None and not low <= 0 <= high:
                     apart.append(name)
-        kind = f"told apart by {' and '.join(apart)}" if apart else "not told apart"
+        kind = f"differ in {' and '.join(apart)}" if apart else "show no difference"
         yield (
-            f"{task}: threshold {coin.drops_like} and a coin that drops as much are {kind} "
-            f"(threshold minus coin: {', '.join(said)}; {pairs} pairs)."
+            f"{task}: threshold {control.drops_like} and its matched random control {kind} "
+            f"(threshold minus control: {', '.join(said)}; {pairs} pairs)."
         )
 
 
@@ -242,35 +283,34 @@ def _verdict(task: str, found: Sequence[Mark]) -> str:
             said.append(f"{name} {word} (rank correlation {known[key][0]:.2f}, p {p})")
     explores = {follows["entropy"], follows["coverage"]}
     if explores in ({1}, {-1}):
-        dial = "the threshold moves exploration"
+        answer = "the threshold moves exploration"
         if follows["final_return"] == -follows["entropy"]:
-            dial += " against return, as a dial between the two would"
+            answer += " against return: it trades one for the other"
         elif follows["final_return"]:
-            dial += " and return the same way"
+            answer += " and return the same way"
         else:
-            dial += ", with no evidence that return follows"
+            answer += ", with no evidence that return follows"
     else:
-        dial = (
-            "no evidence that the threshold is a dial of exploration: entropy and coverage do "
-            "not both follow it one way"
+        answer = (
+            "no evidence that the threshold moves exploration: entropy and coverage do not both "
+            "follow it one way"
         )
-    coins = any(mark.drops_like for mark in found)
-    if explores in ({1}, {-1}) and coins:
-        dial += " (what fewer updates alone do, the coins say)"
+    if explores in ({1}, {-1}) and any(mark.drops_like for mark in found):
+        answer += " (the matched random controls show what fewer updates alone do)"
     number, wanted = known["coverage"][2], sum(m.seeds for m in found if m.kind == "constant")
     so_far = "" if number == wanted else f" of {wanted} so far"
-    return f"{task}: {dial}. With a rising threshold {'; '.join(said)}; {number} members{so_far}."
+    return f"{task}: {answer}. With a rising threshold {'; '.join(said)}; {number} members{so_far}."
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """Each quantity against the threshold, a panel for each task."""
+    """Returns each quantity against the threshold, a panel for each task."""
     found = {task: marks(measured, task) for task in tasks_of(measured)}
     drawn = []
     for key, name, title, caption in QUANTITIES:
         panels = [Panel(task, _lines(own, key)) for task, own in found.items()]
         limits = (0.0, 1.0) if key == "keep_rate" else None
         text = f"{caption} Point: mean of the members; band: 95% interval."
-        plot = Plot(f"dial_{key}", title, text, "threshold", name, limits, panels)
+        plot = Plot(f"sweep_{key}", title, text, "threshold", name, limits, panels)
         if any(panel.lines for panel in panels):
             drawn.append(plot)
     return drawn
@@ -291,3 +331,13 @@ def _lines(found: Sequence[Mark], key: str) -> list[Line]:
         each = [(seed, x, [dict(mark.members[key]).get(seed) for mark in own]) for seed in seeds]
         lines.append(Line(kind, x, y, low, high, each))
     return lines
+
+
+MEASUREMENT = Measurement(
+    "coverage",
+    "sauna.experiments.measure.coverage:compute",
+    report,
+    check=check,
+    check_spaces=check_spaces,
+    scaled=True,
+)

@@ -45,7 +45,7 @@ class Gradients(NamedTuple):
 def estimate(
     gradients: Gradients, groups: tuple[str, ...], pairs: tuple[tuple[str, str], ...]
 ) -> dict[str, Any]:
-    """Every estimate of every group, and differences between the `pairs` of groups.
+    """Returns every estimate of every group, and differences between the `pairs` of groups.
 
     Returns:
       `{"groups": {group: {name: [value, low, high]}}, "differences": {"a - b": {...}},

@@ -21,7 +21,8 @@ def policy_gradient(
     policy: Policy,
     standardized: bool,
 ) -> Array:
-    """The direction `[D]` in which the surrogate of eq. 3 rises, at a probability ratio of 1.
+    """Returns the direction `[D]` in which the surrogate of eq. 3 rises, at a probability ratio of
+    1.
 
     There the clipping does nothing, and this is `mean(A grad log pi(a | s))`. The losses of value,
     Vex and entropy are left out.

@@ -1,12 +1,12 @@
-"""Is what the filter drops noisier than what a coin drops? Measured at one checkpoint.
+"""Is what the filter drops noisier than random steps? Measured at one checkpoint.
 
 Half of the fresh streams give the reference: the policy gradient of all their env steps. From each
 stream of the other half, minibatches of training's size are drawn from four groups of its steps:
 
     kept     by the filter
     dropped  by the filter
-    coin     kept by a coin that keeps as many: a random part of all steps; what it drops is
-             distributed alike, so it is the control of both, and stands for all steps
+    control  a random part of all steps, as many as are kept: the matched random control. What it
+             drops is distributed alike, so it is the control of both, and stands for all steps
     shifted  dropped by the filter's own decisions moved in time by a random offset: as many, and
              as bunched, as the dropped, but not chosen by what the head says there
 
@@ -17,6 +17,7 @@ policy gradient of another weighting of states: a bias, which `alignment` shows 
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -26,28 +27,33 @@ import numpy as np
 from sauna.algorithm.types import Array
 from sauna.experiments.measure.estimates import Gradients, estimate
 from sauna.experiments.measure.gradient import policy_gradient
-from sauna.experiments.measure.streams import Standing, Stream, fresh_streams
+from sauna.experiments.measure.streams import MemberSnapshot, Stream, fresh_streams
 
 STREAMS = 64  # half of them are the reference
 STEPS = 4096  # kept ones that the rollouts of a stream have room for, at least
 MINIBATCHES = 64  # of each group and stream
-LEAST_STREAMS = 8  # with enough steps of every group, below which nothing is estimated
-GROUPS = ("kept", "dropped", "coin", "shifted")
-PAIRS = (("dropped", "coin"), ("kept", "coin"), ("dropped", "shifted"))
+MIN_STREAMS = 8  # with enough steps of every group, below which nothing is estimated
+GROUPS = ("kept", "dropped", "control", "shifted")
+PAIRS = (("dropped", "control"), ("kept", "control"), ("dropped", "shifted"))
 RULES = {"standardized": True, "raw": False}
 
 
-def measure(standing: Standing, streams: int = STREAMS) -> dict[str, Any]:
-    """All that is found at a checkpoint, as JSON values.
+def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]:
+    """Measures the noise of minibatch gradients at a checkpoint; see `measure`."""
+    return measure(snapshot)
+
+
+def measure(snapshot: MemberSnapshot, streams: int = STREAMS) -> dict[str, Any]:
+    """Measures the noise of minibatch gradients at a checkpoint, as JSON values.
 
     Under `rules`, `standardized` standardises the advantages of every minibatch (and once those of
     the whole reference), as training does by default; `raw` leaves them as they are. Where fewer
-    than `LEAST_STREAMS` streams have a minibatch of every group, `rules` is empty.
+    than `MIN_STREAMS` streams have a minibatch of every group, `rules` is empty.
     """
-    config = standing.config
+    config = snapshot.config
     rollout = config.rollout_steps * config.envs
     size = rollout // config.minibatches
-    fresh = fresh_streams(standing, streams, -(-STEPS // rollout))
+    fresh = fresh_streams(snapshot, streams, -(-STEPS // rollout))
     collected = fresh.streams
     reference, tested = collected[: streams // 2], collected[streams // 2 :]
     usable = [stream for stream in tested if _smallest(stream) >= size]
@@ -60,11 +66,11 @@ def measure(standing: Standing, streams: int = STREAMS) -> dict[str, Any]:
         "as_trained": "standardized" if config.normalize_advantages else "raw",
         "rules": {},
     }
-    if len(usable) >= LEAST_STREAMS:
-        random = np.random.default_rng([standing.member.seed, standing.iteration])
+    if len(usable) >= MIN_STREAMS:
+        random = np.random.default_rng([snapshot.member.seed, snapshot.iteration])
         drawn = [draw(stream, size, random) for stream in usable]
         for rule, standardized in RULES.items():
-            gradients = gradients_of(standing, reference, usable, drawn, standardized)
+            gradients = gradients_of(snapshot, reference, usable, drawn, standardized)
             found["rules"][rule] = estimate(gradients, GROUPS, PAIRS)
     return found
 
@@ -76,13 +82,14 @@ def _smallest(stream: Stream) -> int:
 
 
 def draw(stream: Stream, size: int, random: np.random.Generator) -> np.ndarray:
-    """Rows `[groups, MINIBATCHES, size]` of a stream, each minibatch without replacement."""
+    """Returns rows `[groups, MINIBATCHES, size]` of a stream, each minibatch without
+    replacement."""
     steps = len(stream.keep)
-    coin = random.permutation(steps)[: int(stream.keep.sum())]
+    control = random.permutation(steps)[: int(stream.keep.sum())]
     groups = (
         np.flatnonzero(stream.keep),
         np.flatnonzero(~stream.keep),
-        coin,
+        control,
         np.flatnonzero(~stream.shifted),
     )
     return np.stack(
@@ -91,14 +98,15 @@ def draw(stream: Stream, size: int, random: np.random.Generator) -> np.ndarray:
 
 
 def gradients_of(
-    standing: Standing,
+    snapshot: MemberSnapshot,
     reference: list[Stream],
     tested: list[Stream],
     drawn: list[np.ndarray],
     standardized: bool,
 ) -> Gradients:
-    """The gradients of all reference streams, and of the minibatches `drawn` from the others."""
-    gradient = partial(policy_gradient, policy=standing.program.policy)
+    """Returns the gradients of all reference streams, and of the minibatches `drawn` from the
+    others."""
+    gradient = partial(policy_gradient, policy=snapshot.program.policy)
     whole = jax.jit(partial(gradient, standardized=False))
     advantages = np.concatenate([stream.advantage for stream in reference])
     middle, std = (advantages.mean(), advantages.std() + 1e-8) if standardized else (0.0, 1.0)
@@ -106,7 +114,7 @@ def gradients_of(
     of_reference = np.stack(
         [
             whole(
-                standing.params,
+                snapshot.params,
                 padded(s.observation, length),
                 padded(s.action, length),
                 padded((s.advantage - middle) / std, length),
@@ -119,7 +127,7 @@ def gradients_of(
     direction = of_reference.mean(0) / np.linalg.norm(of_reference.mean(0))
     results = [
         batches(
-            standing.params,
+            snapshot.params,
             direction,
             padded(s.observation, length),
             padded(s.action, length),
@@ -130,12 +138,13 @@ def gradients_of(
     ]
     mean, power, cosine = (np.stack(p).astype(np.float64) for p in zip(*results, strict=True))
     kept = np.array([stream.keep.mean() for stream in tested])
-    rate = np.stack([kept, 1 - kept, np.ones(len(kept)), 1 - kept], 1)  # a coin stands for all
+    rate = np.stack([kept, 1 - kept, np.ones(len(kept)), 1 - kept], 1)  # the control stands for all
     return Gradients(mean, power, cosine, of_reference.astype(np.float64), rate)
 
 
 def padded(x: np.ndarray, length: int) -> np.ndarray:
-    """`x` `[n, ...]` with zeros behind, `[length, ...]` float32 (integers stay): one program."""
+    """Returns `x` `[n, ...]` with zeros behind, `[length, ...]` float32 (integers stay): one
+    program."""
     x = x.astype(np.float32) if x.dtype == np.float64 else x
     return np.concatenate([x, np.zeros((length - len(x), *x.shape[1:]), x.dtype)])
 

@@ -1,4 +1,4 @@
-"""Is what the filter drops noisier than what a coin drops? What `sauna study noise` says of it.
+"""The measurement `noise`: is what the filter drops noisier than random steps?
 
 Noise has two measures here. Signal to noise is with advantages as in training. Variance is with
 advantages as they are: to standardise those of a minibatch of dropped steps would divide out what
@@ -13,31 +13,42 @@ result file.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.report import style
-from sauna.experiments.report.figures import Extra, Line, Panel, Plot
+from sauna.experiments.report.figures import Line, Panel, Plot, Section
 from sauna.experiments.report.numbers import interval
-from sauna.experiments.report.tables import table
 from sauna.experiments.statistics import Estimate, mean_interval
+from sauna.system.errors import BadInput
 
-GROUPS = ("kept", "dropped", "coin", "shifted")
-TITLE = "Is what the filter drops noisier than what a coin drops?"
+GROUPS = ("kept", "dropped", "control", "shifted")
+# Words in results of 0.1.0.
+FORMER_KEYS = {
+    "control": "coin",
+    "dropped - control": "dropped - coin",
+    "kept - control": "kept - coin",
+}
+TITLE = "Is what the filter drops noisier than random steps?"
+NOISIER, LESS_NOISY = "is noisier than", "is less noisy than"
 ABOUT = (
-    "At checkpoints along training, with policy, head and normaliser as they stood: the "
-    "policy gradient of minibatches of kept steps, of dropped ones, of steps that a coin kept, and "
-    "of steps dropped by the filter's decisions moved in time (shifted: as many, and as bunched). "
+    "At checkpoints along training, with policy, head and normaliser as in the checkpoint: the "
+    "policy gradient of minibatches of kept steps, of dropped ones, of steps that a matched random "
+    "control kept (as many, at random), and of steps dropped by the filter's decisions moved in "
+    "time (shifted: as many, and as bunched). "
     "Signal to noise is the squared length of a group's mean gradient over the trace of its "
     "covariance, for one minibatch; variance is that trace, in the table one group's over "
     "another's. Advantages are standardised in each minibatch as in training, except where raw is "
     "said: of steps with large advantages both signal and variance are large then, and the one can "
     "rise without the other. Cosine is that of a minibatch's gradient and of a large independent "
-    "batch of all steps. Alignment is the cosine with endless minibatches: below 1 where the "
-    "group's gradient is biased, not only noisy; it is known only at checkpoints with a signal "
-    "that can be told from none (how many stands behind it), and its estimates go above 1. In "
+    "batch of all steps. Alignment is the cosine with endless minibatches: below 1 if the "
+    "group's gradient is biased, not only noisy; it is known only at checkpoints whose signal "
+    "differs from none (their number follows it), and its estimates go above 1. In "
     "brackets: 95% over members, each the mean of its checkpoints; not corrected for the number of "
     "comparisons."
 )
@@ -60,10 +71,10 @@ _PLOTS: tuple[tuple[str, str, str, str, tuple[float, float] | None], ...] = (
     ),
     (
         "variance",
-        "Variance of a minibatch's gradient beside a coin's",
-        "Trace of the group's "
-        "covariance over that of what a coin keeps, advantages raw; means are geometric.",
-        "of a coin's variance",
+        "Variance of a minibatch's gradient, control = 1",
+        "Trace of the group's covariance over that of what the matched random control keeps, "
+        "advantages raw; means are geometric.",
+        "variance, control = 1",
         None,
     ),
 )
@@ -73,40 +84,70 @@ HEAD = (
     "Members",
     "Keep rate",
     "SNR kept",
-    "SNR coin",
+    "SNR control",
     "SNR dropped",
-    "SNR dropped - coin",
+    "SNR dropped - control",
     "SNR dropped - shifted",
-    "SNR per env step, kept - coin",
-    "Cosine dropped - coin",
+    "SNR per env step, kept - control",
+    "Cosine dropped - control",
     "Alignment of kept",
-    "Variance, kept / coin",
-    "Raw variance, kept / coin",
-    "Raw variance, dropped / coin",
+    "Variance, kept / control",
+    "Raw variance, kept / control",
+    "Raw variance, dropped / control",
     "Raw variance, dropped / shifted",
 )
 
 
-def extra(measured: Mapping[str, Any]) -> Extra:
-    """The section and the figures that the study's page gets."""
-    head, *rows = text_table(measured)
-    html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(
-        head,
-        [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows],
-        name="Noise of minibatch gradients",
+def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
+    """Reports on all results in a section of the study's page; `folder` is not read."""
+    return Section(
+        TITLE,
+        verdicts(measured),
+        ABOUT,
+        text_table(measured),
+        "Noise of minibatch gradients",
+        plots(measured),
+        looks(),
+        answer=_answer(measured),
     )
-    return Extra(TITLE, html, plots(measured), looks())
+
+
+def check(configs: Sequence[Config]) -> None:
+    """Refuses a study in which no arm drops steps whose advantages are known.
+
+    Raises:
+      BadInput
+    """
+    if not any(map(drops_steps, configs)):
+        raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
+
+
+def drops_steps(config: Config) -> bool:
+    """Returns whether steps are dropped, and the advantages of dropped ones are known."""
+    return config.filter != "none" and config.gae_over != "kept"
+
+
+def check_spaces(config: Config, spaces: Spaces) -> None:
+    """Refuses observations that are too large to keep.
+
+    Raises:
+      BadInput
+    """
+    if spaces.observation_kind == "image":
+        raise BadInput(
+            "measure: noise keeps rollouts of observations in memory, which images are too large "
+            "for"
+        )
 
 
 def looks() -> dict[str, style.Look]:
-    """A colour for each group of steps."""
-    arms = {"kept": "sauna", "dropped": "vex-head", "coin": "random-drop", "shifted": "ppo"}
+    """Returns a colour for each group of steps."""
+    arms = {"kept": "sauna", "dropped": "vex-head", "control": "random-drop", "shifted": "ppo"}
     return dict(zip(arms, style.looks({arm: arm for arm in arms.values()}).values(), strict=True))
 
 
 def rule(point: Mapping[str, Any], raw: bool = False) -> Mapping[str, Any] | None:
-    """A checkpoint's estimates, advantages as in training or `raw`.
+    """Returns a checkpoint's estimates, advantages as in training or `raw`.
 
     None where too little was dropped.
     """
@@ -114,7 +155,8 @@ def rule(point: Mapping[str, Any], raw: bool = False) -> Mapping[str, Any] | Non
 
 
 def over_members(cell: Mapping[str, Any], *path: str, raw: bool = False) -> Estimate:
-    """Mean over members of their means over checkpoints, and its interval; geometric of ratios.
+    """Computes the mean over members of their means over checkpoints, and its interval; geometric
+    of ratios.
 
     Args:
       path: of the value in a checkpoint's estimates.
@@ -135,28 +177,29 @@ def over_members(cell: Mapping[str, Any], *path: str, raw: bool = False) -> Esti
 def _value(point: Mapping[str, Any], path: Sequence[str], raw: bool = False) -> float | None:
     found: Any = rule(point, raw)
     for key in path:
-        found = None if found is None else found[key]
+        if found is not None:
+            found = found[key] if key in found else found[FORMER_KEYS[key]]
     return None if found is None else found[0]
 
 
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
-    """The head, and a row for each task and arm."""
+    """Returns the head, and a row for each task and arm."""
     rows = [list(HEAD)]
     for cell in measured["cells"]:
         rates = [point["keep_rate"] for point in _points(cell)]
         used = sum(any(rule(p) for p in m["points"]) for m in cell["members"])
         values = [
-            *(over_members(cell, "groups", name, "snr") for name in ("kept", "coin", "dropped")),
-            over_members(cell, "differences", "dropped - coin", "snr"),
+            *(over_members(cell, "groups", name, "snr") for name in ("kept", "control", "dropped")),
+            over_members(cell, "differences", "dropped - control", "snr"),
             over_members(cell, "differences", "dropped - shifted", "snr"),
-            over_members(cell, "differences", "kept - coin", "snr_per_env_step"),
-            over_members(cell, "differences", "dropped - coin", "cosine"),
+            over_members(cell, "differences", "kept - control", "snr_per_env_step"),
+            over_members(cell, "differences", "dropped - control", "cosine"),
         ]
         ratios = [
-            _ratio(cell, "kept - coin"),
+            _ratio(cell, "kept - control"),
             *(
                 _ratio(cell, pair, raw=True)
-                for pair in ("kept - coin", "dropped - coin", "dropped - shifted")
+                for pair in ("kept - control", "dropped - control", "dropped - shifted")
             ),
         ]
         rate = f"{np.mean(rates):.2f}" if rates else "-"
@@ -187,13 +230,13 @@ def _alignment(cell: Mapping[str, Any]) -> str:
 
 
 def shown_ratio(estimate: Estimate) -> str:
-    """Three decimals where it is about 1, else as `shown`."""
+    """Returns three decimals where it is about 1, else as `shown`."""
     near = estimate.high is not None and 0.5 < estimate.high < 2
     return interval(estimate, 3) if near else shown(estimate)
 
 
 def shown(estimate: Estimate) -> str:
-    """Two significant digits of the value, and its interval to the same place."""
+    """Returns two significant digits of the value, and its interval to the same place."""
     value, low, high = estimate
     if value is None:
         return "-"
@@ -205,8 +248,26 @@ def shown(estimate: Estimate) -> str:
 
 
 def verdicts(measured: Mapping[str, Any]) -> list[str]:
-    """The answer for each task and arm, in a sentence that claims no more than its interval."""
+    """Answers for each task and arm in a sentence that claims no more than its interval."""
     return [_verdict(cell) for cell in measured["cells"]]
+
+
+def _answer(measured: Mapping[str, Any]) -> str:
+    """Counts the arms and tasks by what is found of them; empty before anything is."""
+    cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
+    if not cells:
+        return ""
+    by_variance = [_kind(_ratio(c, "dropped - control", raw=True), 1.0, noisier=1) for c in cells]
+    by_signal = [
+        _kind(over_members(c, "differences", "dropped - control", "snr"), 0.0, noisier=-1)
+        for c in cells
+    ]
+    said = [
+        f"by {name} noisier in {kinds.count(NOISIER)}, less noisy in {kinds.count(LESS_NOISY)} of "
+        f"{len(cells)} pairs of a task and an arm"
+        for name, kinds in (("variance", by_variance), ("signal to noise", by_signal))
+    ]
+    return f"What the filter drops is {said[0]}, {said[1]}."
 
 
 def _verdict(cell: Mapping[str, Any]) -> str:
@@ -220,16 +281,19 @@ def _verdict(cell: Mapping[str, Any]) -> str:
             f"{where}: no answer, because the filter dropped too few steps at each of "
             f"{len(points)} checkpoints."
         )
-    difference = over_members(cell, "differences", "dropped - coin", "snr")
-    dropped, coin = (over_members(cell, "groups", name, "snr") for name in ("dropped", "coin"))
-    ratio, kept = _ratio(cell, "dropped - coin", raw=True), _ratio(cell, "kept - coin")
-    means = [shown(Estimate(found.value, None, None)) for found in (dropped, coin)]
+    difference = over_members(cell, "differences", "dropped - control", "snr")
+    dropped, control = (
+        over_members(cell, "groups", name, "snr") for name in ("dropped", "control")
+    )
+    ratio, kept = _ratio(cell, "dropped - control", raw=True), _ratio(cell, "kept - control")
+    means = [shown(Estimate(found.value, None, None)) for found in (dropped, control)]
     text = (
-        f"{where}: by variance what the filter drops {_kind(ratio, 1.0, noisier=1)} what a coin "
-        f"drops ({shown_ratio(ratio)} times a coin's, advantages raw); by signal to noise it "
-        f"{_kind(difference, 0.0, noisier=-1)} that ({means[0]} against {means[1]} per minibatch "
+        f"{where}: by variance what the filter drops {_kind(ratio, 1.0, noisier=1)} what a matched "
+        f"random control drops ({shown_ratio(ratio)} times the control's, advantages raw); by "
+        f"signal to noise it {_kind(difference, 0.0, noisier=-1)} that ({means[0]} against "
+        f"{means[1]} per minibatch "
         f"of {measured[0]['minibatch']}, difference {shown(difference)}). As trained, minibatches "
-        f"of what it keeps have {shown_ratio(kept)} times the variance of a coin's."
+        f"of what it keeps have {shown_ratio(kept)} times the variance of the control's."
     )
     if len(measured) < len(points):
         text += (
@@ -240,16 +304,16 @@ def _verdict(cell: Mapping[str, Any]) -> str:
 
 
 def _kind(estimate: Estimate, equal: float, noisier: int) -> str:
-    """What an interval says of the dropped; `noisier` is the side of `equal` that means it."""
+    """Puts into words where the interval lies; `noisier` is the side of `equal` that means it."""
     if estimate.low is None or estimate.high is None:
-        return "is of too few members to be told from"
+        return "is underpowered to be compared with"
     if estimate.low <= equal <= estimate.high:
-        return "is not told from"
-    return "is noisier than" if (estimate.low > equal) == (noisier > 0) else "is less noisy than"
+        return "shows no difference from"
+    return NOISIER if (estimate.low > equal) == (noisier > 0) else LESS_NOISY
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """Each group along training, a panel for each task and arm."""
+    """Returns each group along training, a panel for each task and arm."""
     cells = [cell for cell in measured["cells"] if any(map(rule, _points(cell)))]
     found = []
     for key, title, caption, label, limits in _PLOTS:
@@ -286,11 +350,11 @@ def _line(cell: Mapping[str, Any], group: str, key: str) -> Line:
 
 
 def _drawn(point: Mapping[str, Any], group: str, key: str) -> float | None:
-    """What a figure shows of a group at a checkpoint: of its variance the ratio to the coin's."""
+    """What a figure shows of a group at a checkpoint; its variance is over the control's."""
     if key != "variance":
         return _value(point, ("groups", group, key))
-    own, coin = (_value(point, ("groups", name, key), raw=True) for name in (group, "coin"))
-    return None if own is None or coin is None else own / coin
+    own, control = (_value(point, ("groups", name, key), raw=True) for name in (group, "control"))
+    return None if own is None or control is None else own / control
 
 
 def _mean(values: Sequence[float], geometric: bool) -> list[float]:
@@ -298,3 +362,13 @@ def _mean(values: Sequence[float], geometric: bool) -> list[float]:
     x = np.log(values) if geometric else np.asarray(values)
     ends = [float(end[0]) for end in mean_interval(x[:, None])]
     return [float(np.exp(end)) for end in ends] if geometric else ends
+
+
+MEASUREMENT = Measurement(
+    "noise",
+    "sauna.experiments.measure.noise:compute",
+    report,
+    check=check,
+    check_spaces=check_spaces,
+    applies=drops_steps,
+)

@@ -1,4 +1,4 @@
-"""Whether a HalfCheetah runs on its feet or slides on its back, as its policy stands.
+"""Whether a HalfCheetah runs on its feet or slides on its back, with the policy of a checkpoint.
 
 The torso's pitch is the angle of the joint `rooty`, which nothing wraps: a cheetah that has turned
 over twice is upright again. It is upright where the cosine of the pitch is positive.
@@ -14,34 +14,37 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.make import make_drawn_env, make_env
-from sauna.experiments.evaluate.artifact import Artifact
-from sauna.experiments.evaluate.episodes import choose_renderer, not_drawn, play
+from sauna.experiments.evaluate.artifact import Artifact, load_artifact
+from sauna.experiments.evaluate.play import play
 from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.evaluate.video import choose_renderer, not_drawn
+from sauna.experiments.measure.streams import MemberSnapshot
 
 EPISODES = 5
 SEED = 0  # of the first episode: the same ones for every member
-STILLS = (0, 20, 50, 100, 200, 400, 600, 900)  # env steps of the episode that is shown
-SIDE = 160  # pixels of a still
+FRAMES = (0, 20, 50, 100, 200, 400, 600, 900)  # env steps of the episode that is shown
+SIDE = 160  # pixels of a frame
 
 
 def pitch(env: Any) -> float:
-    """The torso's angle about its side axis in radians, -pi to pi; 0 is on its feet, level."""
+    """Returns the torso's angle about its side axis in radians, -pi to pi; 0 is on its feet,
+    level."""
     return math.remainder(float(env.unwrapped.data.joint("rooty").qpos[0]), math.tau)
 
 
-def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
+def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]:
     """Plays `EPISODES` episodes with sampled actions and the frozen normaliser.
 
-    Args:
-      stills: the picture that shows one episode at `STILLS`, side by side: the clearest in
-        the posture of most states. Where nothing can be drawn it is not written, and the result
-        says why.
+    A picture beside `file` shows one episode at `FRAMES`, side by side: the clearest in the posture
+    of most states. Where nothing can be drawn it is not written, and the result says why.
 
     Returns:
       of each episode its return, its length and the share of states in which the torso is
       `upright`; that share over all states; the index of the episode that is `shown`, the env
-      steps of its stills and the `picture` of them, or why they are `not_drawn`.
+      steps of its `frames` and the `picture` of them, or why they are `not_drawn`.
     """
+    artifact = load_artifact(snapshot.run, iteration=snapshot.iteration)
+    name, picture = snapshot.member.name, file.with_suffix(".png")
     kwargs = json.loads(artifact.config.env_kwargs)
     env = make_env(artifact.config.env, kwargs)
     policy = TrainedPolicy(artifact, name, env)
@@ -61,19 +64,20 @@ def measure(artifact: Artifact, name: str, stills: Path) -> dict[str, Any]:
         "mode": "sampled",
         "episodes": episodes,
         "upright": share,
-        **_draw(artifact, name, kwargs, shown, stills),
+        **_draw(artifact, name, kwargs, shown, picture),
     }
 
 
 def clearest(upright: list[float], share: float) -> int:
-    """The episode that is the most on its feet where most states (`share`) are, or on its back."""
+    """Returns the episode that is the most on its feet where most states (`share`) are, or on its
+    back."""
     return int(np.argmax(upright) if share > 0.5 else np.argmin(upright))
 
 
 def _draw(
     artifact: Artifact, name: str, kwargs: dict[str, Any], shown: int, path: Path
 ) -> dict[str, Any]:
-    """Plays an episode once more and writes its stills."""
+    """Plays an episode once more and writes its frames."""
     from PIL import Image
 
     choose_renderer()
@@ -83,16 +87,16 @@ def _draw(
     def look() -> None:
         nonlocal step
         step += 1
-        if step in STILLS:
+        if step in FRAMES:
             pictures[step] = Image.fromarray(env.render()).resize((SIDE, SIDE))
 
     try:
         env = make_drawn_env(artifact.config.env, kwargs)
         play(TrainedPolicy(artifact, name, env), env, False, SEED + shown, look)
     except Exception as error:  # renderers fail in every way there is
-        return {"stills": [], "not_drawn": not_drawn(error)}
+        return {"frames": [], "not_drawn": not_drawn(error)}
     strip = Image.new("RGB", (SIDE * len(pictures), SIDE))
     for place, picture in enumerate(pictures.values()):
         strip.paste(picture, (SIDE * place, 0))
     strip.save(path, "PNG")
-    return {"shown": shown, "stills": [*pictures], "picture": path.name}
+    return {"shown": shown, "frames": [*pictures], "picture": path.name}

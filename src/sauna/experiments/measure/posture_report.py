@@ -1,4 +1,4 @@
-"""Does it run on its feet or slide on its back? What `sauna study fig5` says of HalfCheetah.
+"""The measurement `posture`: does HalfCheetah run on its feet or slide on its back?
 
 A seed is on its feet if its torso is upright in more than half of the states of the episodes that
 its finished policy plays. Seeds are paired here, as in the paper's figure: both arms of a pair
@@ -7,19 +7,19 @@ begin with the same weights and the same resets, and part after the first update
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterator, Mapping
-from html import escape
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
+from sauna.config.settings import Config
+from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.report import style
-from sauna.experiments.report.figures import Extra, Line, Panel, Plot
-from sauna.experiments.report.tables import table
+from sauna.experiments.report.figures import Line, Panel, Plot, Section, SectionImage
 from sauna.experiments.statistics import ALPHA, Estimate
+from sauna.system.errors import BadInput
 
 TITLE = "On its feet or on its back?"
 ABOUT = (
@@ -36,7 +36,7 @@ class Posture(NamedTuple):
     seed: int
     upright: float  # share of states
     return_: float  # mean over the episodes
-    stills: list[int]  # env steps that a picture shows
+    frames: list[int]  # env steps that a picture shows
     picture: str  # its file's name
     curve: Mapping[str, Any]  # the explained variance over training
 
@@ -57,13 +57,13 @@ class Pair(NamedTuple):
 
 
 def postures(cell: Mapping[str, Any]) -> list[Posture]:
-    """The measured members of a cell."""
+    """Returns the measured members of a cell."""
     return [
         Posture(
             member["seed"],
             point["upright"],
             float(np.mean([episode["return"] for episode in point["episodes"]])),
-            point["stills"],
+            point["frames"] if "frames" in point else point["stills"],  # the name in 0.1.0
             point.get("picture", ""),
             member["curve"],
         )
@@ -73,7 +73,7 @@ def postures(cell: Mapping[str, Any]) -> list[Posture]:
 
 
 def share(found: list[Posture]) -> Estimate:
-    """Share of seeds on their feet, with Wilson's interval."""
+    """Computes the share of seeds on their feet, with Wilson's interval."""
     if not found:
         return Estimate(None, None, None)
     feet = sum(one.on_feet for one in found)
@@ -82,7 +82,7 @@ def share(found: list[Posture]) -> Estimate:
 
 
 def pairs(measured: Mapping[str, Any]) -> Iterator[Pair]:
-    """Every arm that has a baseline among the cells of its task.
+    """Returns every arm that has a baseline among the cells of its task.
 
     Of the seeds whose posture differs between the arms, McNemar's test asks whether as many differ
     one way as the other: a binomial test with a chance of one half.
@@ -100,7 +100,7 @@ def pairs(measured: Mapping[str, Any]) -> Iterator[Pair]:
 
 
 def verdicts(measured: Mapping[str, Any]) -> list[str]:
-    """The shares and the comparisons as sentences that claim no more than their test."""
+    """Reports the shares and the comparisons in sentences that claim no more than their test."""
     said = []
     for cell in measured["cells"]:
         found = postures(cell)
@@ -116,7 +116,7 @@ def verdicts(measured: Mapping[str, Any]) -> list[str]:
 
 
 def shown(estimate: Estimate) -> str:
-    """`25% [11%, 47%]`; `-` where there is none."""
+    """Returns `25% [11%, 47%]`; `-` where there is none."""
     value, low, high = estimate
     return "-" if value is None else f"{value:.0%} [{low:.0%}, {high:.0%}]"
 
@@ -133,23 +133,39 @@ def _compared(pair: Pair) -> str:
     )
 
 
-def extra(measured: Mapping[str, Any], place: Path | None = None) -> Extra:
-    """The section and the figure that the study's page gets.
+def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
+    """Reports on all results in a section of the study's page.
 
     Args:
-      place: the study's folder, where `figures/stills.png` is written if there are stills.
+      folder: the study's, where `figures/frames.png` is written if there are frames.
     """
-    head, *rows = text_table(measured)
-    html = "".join(f"<p>{escape(text)}</p>" for text in [*verdicts(measured), ABOUT])
-    html += table(
-        head, [(escape(row[0]), [escape(x) for x in row[1:]]) for row in rows], name="Postures"
+    answers = verdicts(measured)
+    return Section(
+        TITLE,
+        answers,
+        ABOUT,
+        text_table(measured),
+        "Postures",
+        plots(measured),
+        style.looks({cell["label"]: cell["arm"] for cell in measured["cells"]}),
+        _frames(measured, folder) if folder else None,
+        answer=answers[-1],
     )
-    looks = style.looks({cell["label"]: cell["arm"] for cell in measured["cells"]})
-    return Extra(TITLE, html + (_figure(measured, place) if place else ""), plots(measured), looks)
+
+
+def check(configs: Sequence[Config]) -> None:
+    """Refuses environments other than HalfCheetah.
+
+    Raises:
+      BadInput
+    """
+    for config in configs:
+        if not config.env.startswith("HalfCheetah"):
+            raise BadInput(f'study: measure = "posture" is of HalfCheetah, not of {config.env}')
 
 
 def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
-    """The head, and a row for each arm."""
+    """Returns the head, and a row for each arm."""
     rows = [["Arm", "Seeds", "On its feet", "Between", "Return on its feet", "Return on its back"]]
     for cell in measured["cells"]:
         found = postures(cell)
@@ -161,7 +177,7 @@ def text_table(measured: Mapping[str, Any]) -> list[list[str]]:
 
 
 def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
-    """The two members whose stills are shown, the baseline's first.
+    """Returns the two members whose frames are shown, the baseline's first.
 
     The first seed on its feet in the arm and on its back in the baseline; failing that, the first
     that is measured in both.
@@ -179,7 +195,7 @@ def shown_pair(measured: Mapping[str, Any]) -> list[tuple[str, Posture]]:
 
 
 def chosen(measured: Mapping[str, Any]) -> str:
-    """How the pair that is shown was chosen, and how usual it is."""
+    """Returns how the pair that is shown was chosen, and how usual it is."""
     pair = next(pair for pair in pairs(measured) if pair.seeds)
     return (
         f"Chosen for the contrast: the first seed of which only {pair.label} is on its feet "
@@ -188,10 +204,10 @@ def chosen(measured: Mapping[str, Any]) -> str:
     )
 
 
-def _figure(measured: Mapping[str, Any], place: Path) -> str:
-    """The strip of stills as HTML, or why there is none."""
+def _frames(measured: Mapping[str, Any], folder: Path) -> SectionImage | None:
+    """The frames of a pair in one picture, or why there are none."""
     pair = shown_pair(measured)
-    if not pair or not all(one.stills for _, one in pair):
+    if not pair or not all(one.frames for _, one in pair):
         reasons = [
             point["not_drawn"]
             for cell in measured["cells"]
@@ -199,21 +215,18 @@ def _figure(measured: Mapping[str, Any], place: Path) -> str:
             for point in member["points"]
             if "not_drawn" in point
         ]
-        return f"<p>No stills: {escape(reasons[0])}.</p>" if reasons else ""
-    path = draw_stills(pair, place)
-    data = base64.b64encode(path.read_bytes()).decode()
-    text = escape(", ".join(f"{label} seed {one.seed}, {_posture(one)}" for label, one in pair))
-    return (
-        f'<figure id="stills"><figcaption>One pair at equal times, in env steps: {text}. '
-        f"{escape(chosen(measured))} Of each its clearest episode in that posture.</figcaption>"
-        f'<div class="wide" role="region" tabindex="0" aria-label="Stills"><img alt="Stills of '
-        f'{text}" style="display:block;width:100%;min-width:48rem;background:#fff" '
-        f'src="data:image/png;base64,{data}"></div></figure>'
+        return SectionImage(None, "", f"No frames: {reasons[0]}.") if reasons else None
+    text = ", ".join(f"{label} seed {one.seed}, {_posture(one)}" for label, one in pair)
+    return SectionImage(
+        draw_frames(pair, folder).read_bytes(),
+        f"Frames of {text}",
+        f"One pair at equal times, in env steps: {text}. {chosen(measured)} Of each its clearest "
+        "episode in that posture.",
     )
 
 
 def plots(measured: Mapping[str, Any]) -> list[Plot]:
-    """The explained variance of both members of the pair over training."""
+    """Returns the explained variance of both members of the pair over training."""
     pair = shown_pair(measured)
     if not pair:
         return []
@@ -221,9 +234,9 @@ def plots(measured: Mapping[str, Any]) -> list[Plot]:
     for label, one in pair:
         x, y = one.curve["env_steps"], one.curve["explained_variance"]
         lines.append(Line(label, x, y, [None] * len(x), [None] * len(x), []))
-    said = escape(", ".join(f"{label} {_posture(one)}" for label, one in pair))
+    said = ", ".join(f"{label} {_posture(one)}" for label, one in pair)
     caption = (
-        f"Of one pair of seeds: {said}. {escape(chosen(measured))} Over the env steps that an "
+        f"Of one pair of seeds: {said}. {chosen(measured)} Over the env steps that an "
         f"update learned from, which a filter chooses. The axis is cut at -1."
     )
     panel = Panel(f"{measured['cells'][0]['task']}, seed {pair[0][1].seed}", lines)
@@ -244,24 +257,34 @@ def _posture(one: Posture) -> str:
     return f"on its {'feet' if one.on_feet else 'back'} (return {one.return_:,.0f})"
 
 
-def draw_stills(pair: list[tuple[str, Posture]], place: Path) -> Path:
-    """Writes `figures/stills.png`: a row for each member, a column for each time."""
+def draw_frames(pair: list[tuple[str, Posture]], place: Path) -> Path:
+    """Writes `figures/frames.png`: a row for each member, a column for each time."""
     from matplotlib.figure import Figure
     from PIL import Image
 
     with style.applied():
-        steps = [step for step in pair[0][1].stills if step in pair[1][1].stills]
+        steps = [step for step in pair[0][1].frames if step in pair[1][1].frames]
         figure = Figure(figsize=(1.25 * len(steps), 3.2), layout="constrained")
         grid = figure.subplots(2, len(steps), squeeze=False)
         for (label, one), row in zip(pair, grid, strict=True):
-            strip = np.asarray(Image.open(place / "torso" / one.picture))
+            strip = np.asarray(Image.open(MEASUREMENT.folder(place) / one.picture))
             side = strip.shape[0]
             for axes, step in zip(row, steps, strict=True):
-                at = side * one.stills.index(step)
+                at = side * one.frames.index(step)
                 axes.imshow(strip[:, at : at + side])
                 axes.set_xticks([])
                 axes.set_yticks([])
                 axes.grid(False)
                 axes.set_title(f"step {step}" if one is pair[0][1] else "", fontsize=8)
             row[0].set_ylabel(f"{label}\nseed {one.seed}", fontsize=8)
-        return style.save(figure, place / "figures" / "stills.png")
+        return style.save(figure, place / "figures" / "frames.png")
+
+
+MEASUREMENT = Measurement(
+    "posture",
+    "sauna.experiments.measure.posture:compute",
+    report,
+    points=(1.0,),
+    check=check,
+    curves=("explained_variance",),
+)

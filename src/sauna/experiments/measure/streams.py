@@ -1,7 +1,7 @@
 """Fresh experience of a member as it was at one of its checkpoints.
 
 A stream is what the member's next rollouts could have been: its policy, value and Vex head and its
-normaliser as they stood, its own filter deciding, but episodes and action noise of their own. It
+normaliser at that time, its own filter deciding, but episodes and action noise of their own. It
 begins at a random moment of an episode, as rollouts in training do. Every rollout of a stream
 starts from the checkpoint's normaliser; nothing is learned in between. Streams of one checkpoint
 are independent and alike, which is what the statistics rest on; steps within a stream are not.
@@ -25,10 +25,11 @@ from sauna.algorithm.types import Array, Hypers, Rollout, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.config.stored import read_stored
+from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
 from sauna.system import run_directory
-from sauna.system.checkpoint import load_checkpoint
+from sauna.system.checkpoint import BadCheckpoint, load_checkpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, fitting, flat_params, moments_of, under
 
@@ -36,9 +37,10 @@ WARM_UP = 2048  # env steps at most that are thrown away, so that no stream begi
 FRESH = 0x5A07A  # sets the seeds of streams apart from those of training
 
 
-class Standing(NamedTuple):
+class MemberSnapshot(NamedTuple):
     """A member as it was at a checkpoint."""
 
+    run: Path
     config: Config
     spaces: Spaces
     member: Member
@@ -69,31 +71,35 @@ class Fresh(NamedTuple):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Every env step that was taken."""
+        """Returns every env step that was taken."""
         used = sum(len(stream.keep) for stream in self.streams)
         return {"env_steps_used": used, "env_steps_thrown_away": self.thrown_away}
 
 
-def load_standing(run: Path, name: str, iteration: int) -> Standing:
-    """The member `name` of a host run at its checkpoint `iteration`.
+def load_snapshot(run: Path, name: str, iteration: int) -> MemberSnapshot:
+    """Loads the member `name` of a host run as it was at its checkpoint `iteration`.
 
     Raises:
       BadCheckpoint: the checkpoint cannot be trusted or read.
     """
     stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
+    check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust=False)
     settings = read_stored(loaded.manifest)
     spaces = read_spaces(loaded.manifest["spaces"])
     config, everyone = settings.config, settings.members
-    place = next(p for p, member in enumerate(everyone) if member.name == name)
+    place = next((p for p, member in enumerate(everyone) if member.name == name), None)
+    if place is None:
+        raise BadCheckpoint(f"{loaded.path}: its config has no member {name!r}")
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)
     example = program.policy.init(jax.random.key(0))
     params = flat_params(program.policy, example, under("params/", arrays))
     counters = Counters.from_arrays(arrays)
-    rates = stored["drop_rates"][place] if stored["drop_rates"] else []
+    rates = stored["drop_rates"][place] if stored.get("drop_rates") else []
     hypers = hypers_now(everyone[place].config, rates, counters, iteration)
-    return Standing(
+    return MemberSnapshot(
+        run,
         config,
         spaces,
         everyone[place],
@@ -107,28 +113,30 @@ def load_standing(run: Path, name: str, iteration: int) -> Standing:
 
 
 def fresh_streams(
-    standing: Standing, number: int, rollouts: int, limit: int | None = None
+    snapshot: MemberSnapshot, number: int, rollouts: int, limit: int | None = None
 ) -> Fresh:
-    """`number` independent streams of `rollouts` rollouts; the same for the same checkpoint.
+    """Returns `number` independent streams of `rollouts` rollouts; the same for the same
+    checkpoint.
 
     Args:
       limit: env steps that each env tries in a rollout at most; by default as in training.
     """
-    config = standing.config
-    roots = np.random.SeedSequence([FRESH, standing.member.seed, standing.iteration])
+    config = snapshot.config
+    roots = np.random.SeedSequence([FRESH, snapshot.member.seed, snapshot.iteration])
     random = np.random.default_rng(roots)
     seeds = [int(seed) for seed in roots.generate_state(number)]
     pairs = [(seed, n) for seed in seeds for n in range(config.envs)]
-    made = in_process_envs(config.env, json.loads(config.env_kwargs), pairs, config.backend)
+    how = config.backend, config.rescale_actions
+    made = in_process_envs(config.env, json.loads(config.env_kwargs), pairs, *how)
     envs = _Recorded(made)
     try:
         collector = HostCollector(
-            standing.program, standing.spaces, envs, [member_keys(seed) for seed in seeds]
+            snapshot.program, snapshot.spaces, envs, [member_keys(seed) for seed in seeds]
         )
         collector.start()
-        params = np.tile(np.asarray(standing.params), (number, 1))
-        hypers = [standing.hypers] * number
-        _put_moments(collector, standing)
+        params = np.tile(np.asarray(snapshot.params), (number, 1))
+        hypers = [snapshot.hypers] * number
+        _put_moments(collector, snapshot)
         before = random.integers(WARM_UP, size=number)
         first = _warm_up(collector, params, hypers, before, config.rollout_steps)
         parts: list[list[Stream]] = [[] for _ in seeds]
@@ -138,13 +146,13 @@ def fresh_streams(
             partial(advantages_over_all, bootstrap_truncated=config.truncation == "bootstrap")
         )
         for i in range(rollouts):
-            _put_moments(collector, standing)
+            _put_moments(collector, snapshot)
             envs.begin(collector.state.observation)
             collected = collector.collect(params, hypers, first + i, whole)
             seen = envs.seen()
             for p, own in enumerate(collected):
                 assert own.rollout is not None
-                advantage = np.asarray(advantages(own.rollout, standing.hypers))
+                advantage = np.asarray(advantages(own.rollout, snapshot.hypers))
                 parts[p].append(_flat(own.rollout, advantage, seen[:, p]))
                 decisions[p].append([x.copy() for x in _of_envs(own.rollout.keep, own.rollout)])
     finally:
@@ -174,15 +182,16 @@ def _warm_up(
     return rollouts
 
 
-def _put_moments(collector: HostCollector, standing: Standing) -> None:
+def _put_moments(collector: HostCollector, snapshot: MemberSnapshot) -> None:
     """The checkpoint's normaliser in every stream."""
     for p in range(len(collector.state.observation)):
         for key, place in moments_of(collector, p).items():
-            place[...] = fitting(standing.arrays, key, place)
+            place[...] = fitting(snapshot.arrays, key, place)
 
 
 def moved_in_time(decisions: list[list[np.ndarray]], random: np.random.Generator) -> np.ndarray:
-    """A stream's decisions, each env's moved round its whole time line by one random offset.
+    """Returns a stream's decisions, each env's moved round its whole time line by one random
+    offset.
 
     Moved within a rollout, those of A2C's short ones would hardly move.
 
@@ -229,7 +238,7 @@ class _Recorded:
         self._shown = [observation.copy()]
 
     def seen(self) -> np.ndarray:
-        """`[S, P, N, *obs]`: the observation at each env step since `begin`."""
+        """Returns `[S, P, N, *obs]`: the observation at each env step since `begin`."""
         return np.stack(self._shown[:-1])
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Any:

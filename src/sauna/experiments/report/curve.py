@@ -1,22 +1,26 @@
-"""The learning curve of a run as a picture."""
+"""The learning curves of one run, or of several runs, as a figure."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sauna.experiments.report import style
+from sauna.experiments.report.sources import Source, read_sources
 from sauna.system import run_directory
+from sauna.system.errors import BadInput
 
+TRAINING_RETURN = "training return\n(last 100 episodes)"
 GRID = 100  # points at which members' curves are compared
 
 
 def member_curves(
     rows: list[dict[str, Any]],
 ) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """`arm -> member -> (env steps, mean return of the last 100 episodes)`."""
+    """Returns `arm -> member -> (env steps, mean return of the last 100 episodes)`."""
     points: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for row in rows:
         if "return_mean" in row:
@@ -32,7 +36,7 @@ def member_curves(
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """95% interval of the mean over members `[P, X]` (Student's t)."""
+    """Computes the 95% interval of the mean over members `[P, X]` (Student's t)."""
     from scipy import stats
 
     number = values.shape[0]
@@ -41,38 +45,78 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_curve(run: Path) -> Path | None:
-    """Writes `figures/learning_curve.png`; None where no episode has finished."""
+    """Draws `figures/learning_curve.png` of a run; None if no episode has finished."""
     curves = member_curves(run_directory.rows(run))
     if not curves:
         return None
+    config = run_directory.read_config(run)["config"]
+    title = f"{config['env']}, preset {config['preset']}"
+    path = run / "figures" / "learning_curve.png"
+    return _draw(curves, {arm: arm for arm in curves}, title, TRAINING_RETURN, path)
+
+
+def plot(paths: Sequence[Path], out: str = "", tag: str = "") -> Path:
+    """Draws the learning curves of runs that exist; see `read_sources`.
+
+    Args:
+      out: the figure, .png or .svg; empty: `learning_curves.png`, of one run its own figure.
+
+    Raises:
+      BadInput: a path cannot be read, or `out` is no figure.
+    """
+    path = Path(out or "learning_curves.png")
+    if not out and len(paths) == 1 and (paths[0] / "config.json").is_file():
+        path = paths[0] / "figures" / "learning_curve.png"
+    if path.suffix not in (".png", ".svg"):
+        raise BadInput(f"out: {path} must end in .png or .svg")
+    return draw_sources(read_sources(paths, tag), path)
+
+
+def draw_sources(sources: list[Source], path: Path) -> Path:
+    """Draws the curves of runs that exist in one figure, `path` (.png or .svg)."""
+    curves = {s.label: {str(seed): c[:2] for seed, c in s.seeds.items()} for s in sources}
+    tasks = list(dict.fromkeys(source.task for source in sources if source.task))
+    known = all(source.arm for source in sources)
+    arms = {source.label: source.arm or source.label for source in sources}
+    return _draw(curves, arms, ", ".join(tasks), TRAINING_RETURN if known else "return", path)
+
+
+def _draw(
+    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    arms: Mapping[str, str],
+    title: str,
+    y_label: str,
+    path: Path,
+) -> Path:
     from matplotlib.figure import Figure
 
-    config = run_directory.read_config(run)["config"]
-    looks = style.looks({arm: arm for arm in curves})
+    looks = style.looks(arms)
     with style.applied():
         figure = Figure(figsize=(7, 4.2), layout="tight")
         axes = figure.subplots()
-        for arm, members in curves.items():
-            _draw_arm(axes, arm, members, looks[arm])
-        axes.set_ylabel("training return\n(last 100 episodes)")
-        axes.set_title(f"{config['env']}, preset {config['preset']}")
+        for label, members in curves.items():
+            _draw_arm(axes, label, members, looks[label])
+        style.fit_axes(axes, [y for members in curves.values() for _, y in members.values()])
+        axes.set_ylabel(y_label)
+        axes.set_title(title)
         axes.legend()
         style.count_steps(axes)
-        return style.save(figure, run / "figures" / "learning_curve.png")
+        return style.save(figure, path)
 
 
 def _draw_arm(
-    axes: Any, arm: str, members: dict[str, tuple[np.ndarray, np.ndarray]], look: style.Look
+    axes: Any, arm: str, members: Mapping[str, tuple[np.ndarray, np.ndarray]], look: style.Look
 ) -> None:
+    """Draws every seed and, over the env steps that all of them have, their mean."""
     for x, y in members.values():
-        axes.plot(x, y, color=look.colour, alpha=0.3, linewidth=0.8)
+        style.draw_seed(axes, look, x, y)
     first = max(x[0] for x, _ in members.values())
-    last = min(x[-1] for x, _ in members.values())
+    last = max(first, min(x[-1] for x, _ in members.values()))
     grid = np.linspace(first, last, GRID)
     values = np.stack([np.interp(grid, x, y) for x, y in members.values()])
     label = f"{arm}, mean of {len(members)} seed{'s' if len(members) > 1 else ''}"
     low = high = np.full(GRID, np.nan)
-    if len(members) > 1:
+    if len(members) >= style.MIN_BAND:
         low, high = interval(values)
         label += " and 95% interval"
     style.draw_line(axes, look, grid, values.mean(0), low, high, label=label)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from sauna.experiments.report import style
 
 Numbers = list[float | None]
 COLUMNS = 3  # panels side by side
+PANEL = (4.6, 2.9)  # inches of a panel on a page
 WRAP = 38  # characters of a name in one line
 
 
@@ -48,16 +50,42 @@ class Plot:
     panels: list[Panel]
 
 
-class Extra(NamedTuple):
-    """What a measurement adds to the page and the figures of a study."""
+class SectionImage(NamedTuple):
+    """An image of a section; without `png` its caption says why there is none."""
 
-    title: str
-    html: str
-    plots: Sequence[Plot]
-    looks: Mapping[str, style.Look]
+    png: bytes | None
+    alt: str
+    caption: str
 
 
-NOTHING = Extra("", "", (), {})
+class Section(NamedTuple):
+    """What a measurement adds to the page of a study. All texts are plain, no HTML.
+
+    Attributes:
+      title: the question.
+      answers: sentences, each true of itself.
+      about: how it was measured.
+      table: the head and the rows; the first column names a row.
+      table_name: for readers who hear the page.
+      plots, looks: figures, and how their lines look.
+      image: a picture.
+      answer: one sentence; by default the first of `answers`.
+    """
+
+    title: str = ""
+    answers: Sequence[str] = ()
+    about: str = ""
+    table: Sequence[Sequence[str]] = ()
+    table_name: str = ""
+    plots: Sequence[Plot] = ()
+    looks: Mapping[str, style.Look] = MappingProxyType({})
+    image: SectionImage | None = None
+    answer: str = ""
+
+
+NOTHING = Section()
+
+TRAINING_RETURN = "Training return, mean of the last 100 episodes."
 
 # name of the file, key in the curves, title, caption, y axis, its limits
 _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] = (
@@ -65,8 +93,8 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
         "learning_curves",
         "return_mean",
         "Learning curves",
-        "Training return, mean of the last 100 episodes. Line: mean of the seeds; band: 95% "
-        "interval.",
+        TRAINING_RETURN + " Line: mean of the seeds; band: 95% "
+        "interval, of fewer than three seeds each seed instead.",
         "return",
         None,
     ),
@@ -99,12 +127,12 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
 
 
 def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plot]:
-    """Every figure that has something to show."""
+    """Returns every figure that has something to show."""
     plots = [
         Plot(
             name,
             title,
-            caption,
+            caption.replace(TRAINING_RETURN, results.get("curve", TRAINING_RETURN)),
             "env steps",
             y_label,
             limits,
@@ -131,7 +159,7 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
 
 
 def looks_of(results: Mapping[str, Any]) -> dict[str, style.Look]:
-    """The look of each label of a study, in the order of its cells."""
+    """Returns the look of each label of a study, in the order of its cells."""
     return style.looks({cell["label"]: cell["arm"] for cell in results["cells"]})
 
 
@@ -191,7 +219,7 @@ def _any(values: Iterable[float | None]) -> bool:
 
 
 def write_figures(
-    results: Mapping[str, Any], summary: Mapping[str, Any], folder: Path, extra: Extra = NOTHING
+    results: Mapping[str, Any], summary: Mapping[str, Any], folder: Path, extra: Section = NOTHING
 ) -> dict[str, Path]:
     """Writes `folder/figures/NAME.png` and `.svg`; the same bytes for the same input.
 
@@ -216,6 +244,19 @@ def draw_plots(
     return written
 
 
+def panel_svg(plot: Plot, panel: Panel, looks: Mapping[str, style.Look]) -> bytes:
+    """Draws one panel without a legend, as SVG."""
+    from matplotlib.figure import Figure
+
+    with style.applied():
+        figure = Figure(figsize=PANEL)  # fixed margins: a layout engine takes most of the time
+        figure.subplots_adjust(left=0.15, right=0.97, bottom=0.17, top=0.97)
+        axes = figure.subplots()
+        _draw_panel(axes, plot, panel, looks)
+        axes.set_title("")  # the page has it
+        return style.as_svg(figure)
+
+
 def _draw(plot: Plot, looks: Mapping[str, style.Look]) -> Any:
     from matplotlib.figure import Figure
 
@@ -230,12 +271,9 @@ def _draw(plot: Plot, looks: Mapping[str, style.Look]) -> Any:
     size = (width, 2.6 * rows + 0.2 * legend_rows + 0.3)
     figure = Figure(figsize=size, layout="constrained")
     grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-    handles = {}
+    handles: dict[str, Any] = {}
     for axes, panel in zip(grid, plot.panels, strict=False):
-        for line in panel.lines:
-            x, y, low, high = (np.array(v, float) for v in (line.x, line.y, line.low, line.high))
-            handles[line.label] = style.draw_line(axes, looks[line.label], x, y, low, high)
-        _label_axes(axes, plot, panel)
+        handles |= _draw_panel(axes, plot, panel, looks)
     for axes in grid[len(plot.panels) :]:
         axes.set_visible(False)
     figure.legend(
@@ -246,6 +284,26 @@ def _draw(plot: Plot, looks: Mapping[str, style.Look]) -> Any:
         ncols=legend_columns,
     )
     return figure
+
+
+def _draw_panel(
+    axes: Any, plot: Plot, panel: Panel, looks: Mapping[str, style.Look]
+) -> dict[str, Any]:
+    """Draws each line, its band or, of few seeds, these themselves; matplotlib's lines by label."""
+    handles, shown = {}, []
+    for line in panel.lines:
+        x, y, low, high = (np.array(v, float) for v in (line.x, line.y, line.low, line.high))
+        shown.append(y)
+        if 1 < len(line.seeds) < style.MIN_BAND:
+            low = high = np.full(len(x), np.nan)
+            for _, seed_x, seed_y in line.seeds:
+                values = np.array(seed_y, float)
+                style.draw_seed(axes, looks[line.label], np.array(seed_x, float), values)
+                shown.append(values)
+        handles[line.label] = style.draw_line(axes, looks[line.label], x, y, low, high)
+    style.fit_axes(axes, shown)
+    _label_axes(axes, plot, panel)
+    return handles
 
 
 def _label_axes(axes: Any, plot: Plot, panel: Panel) -> None:

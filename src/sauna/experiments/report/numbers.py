@@ -14,7 +14,7 @@ def digits_of(values: Iterable[float | None]) -> int:
 
 
 def digits_of_tasks(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """For each task of a summary's table, decimals that all its arms share."""
+    """Returns, for each task of a summary's table, decimals that all its arms share."""
     return {
         task: digits_of(row["final_iqm"][0] for row in rows if row["task"] == task)
         for task in dict.fromkeys(row["task"] for row in rows)
@@ -22,12 +22,12 @@ def digits_of_tasks(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def number(value: float | None, digits: int) -> str:
-    """`-` where there is none."""
+    """Formats a number; `-` if there is none."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def interval(values: Sequence[float | None] | None, digits: int) -> str:
-    """`0.53 [0.41, 0.65]`: a value and its interval, of what there is of them."""
+    """Returns `0.53 [0.41, 0.65]`: a value and its interval, of what there is of them."""
     if values is None or values[0] is None or values[1] is None:
         return number(values[0] if values else None, digits)
     return f"{number(values[0], digits)} [{number(values[1], digits)}, {number(values[2], digits)}]"

@@ -1,14 +1,20 @@
-"""How every picture looks: the colour, line and marker of each label, and plain axes.
+"""How every figure looks: the colour, line and marker of each label, and plain axes.
 
 Matplotlib is imported where it is used: most commands draw nothing.
 """
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
+
+from sauna.system.safe_write import own_folder, replacing
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; an arm always has its colour.
 COLOURS = {
@@ -22,7 +28,7 @@ COLOURS = {
 _OTHER_ARMS = ("#56B4E9", "#882255", "#997700", "#4B5563")
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")  # matplotlib's names; one for each arm
 _DASHES: tuple[tuple[float, ...], ...] = ((), (6, 2.5), (1.5, 2), (8, 2.5, 1.5, 2.5))
-_SHADES = (0.0, 0.45, -0.45, 0.65)  # towards black on a light page, white where negative
+_SHADES = (0.0, 0.45, -0.45, 0.65)  # towards black, white if negative
 
 _RC: Any = {
     "axes.axisbelow": True,
@@ -42,7 +48,7 @@ _RC: Any = {
     "savefig.dpi": 130,
     "svg.fonttype": "none",  # text stays text: small, and it can be searched
     "svg.hashsalt": "sauna",  # ids of elements: the same in every run
-    "text.parse_math": False,  # a label is a name, also where it holds a dollar
+    "text.parse_math": False,  # a label is a name, even with a dollar in it
     "xtick.color": "#8A8D91",
     "xtick.labelcolor": "#3D4044",
     "xtick.labelsize": 8,
@@ -61,13 +67,12 @@ class Look(NamedTuple):
     """How one label is drawn: `dash` in points on and off, `marker` as matplotlib names it."""
 
     colour: str
-    colour_on_dark: str
     dash: tuple[float, ...]
     marker: str
 
 
 def looks(arms: Mapping[str, str]) -> dict[str, Look]:
-    """`label -> Look`, no two alike, from `label -> arm` in the order of the study.
+    """Returns `label -> Look`, no two alike, from `label -> arm` in the order of the study.
 
     An arm's first label has the arm's own colour and a solid line; its further labels (say
     `sauna 0.8`) have shades of it and other dashes and markers.
@@ -84,7 +89,6 @@ def looks(arms: Mapping[str, str]) -> dict[str, Look]:
         shade = _SHADES[number % len(_SHADES)]
         found[label] = Look(
             colour=_mix(colour, shade),
-            colour_on_dark=_mix(colour, -shade),
             # Moves on when the shades start again, so that the pair is a new one.
             dash=_DASHES[(number + number // len(_SHADES)) % len(_DASHES)],
             marker=_MARKERS[(place + number) % len(_MARKERS)],
@@ -100,7 +104,7 @@ def _mix(colour: str, share: float) -> str:
 
 
 def short(value: float, position: object = None) -> str:
-    """`200000 -> 200k`, `1000000 -> 1M`: ticks of env steps."""
+    """Returns `200000 -> 200k`, `1000000 -> 1M`: ticks of env steps."""
     for size, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{suffix}"
@@ -108,7 +112,7 @@ def short(value: float, position: object = None) -> str:
 
 
 def applied() -> AbstractContextManager[None]:
-    """Within it, matplotlib draws in this style."""
+    """Applies this style to what matplotlib draws within it."""
     import matplotlib
 
     return matplotlib.rc_context(_RC)
@@ -117,7 +121,7 @@ def applied() -> AbstractContextManager[None]:
 def draw_line(
     axes: Any, look: Look, x: Any, y: Any, low: Any, high: Any, *, label: str = ""
 ) -> Any:
-    """A line with about eight markers and, where `low` and `high` are not NaN, its band."""
+    """Draws a line with about eight markers and, where `low` and `high` are not NaN, its band."""
     every = max(1, len(x) // 8)
     first = 2 * len(axes.get_lines()) % every  # lines that lie on each other show both markers
     axes.fill_between(x, low, high, color=look.colour, alpha=0.16, linewidth=0)
@@ -136,14 +140,45 @@ def draw_line(
     return line
 
 
+def draw_seed(axes: Any, look: Look, x: Any, y: Any) -> None:
+    """Draws a thin line for one seed."""
+    axes.plot(x, y, color=look.colour, alpha=0.45, linewidth=0.8)
+
+
 def count_steps(axes: Any) -> None:
-    """The x axis counts env steps."""
+    """Makes the x axis count env steps."""
     axes.set_xlabel("env steps")
     axes.xaxis.set_major_formatter(short)
 
 
+MIN_BAND = 3  # seeds: below, Student's t makes a band that hides the lines
+
+
+def fit_axes(axes: Any, lines: Any) -> None:
+    """Fits the y axis to `lines` (arrays); bands may add a third of their range on either side."""
+    known = [x[np.isfinite(x)] for x in (np.asarray(line, float) for line in lines)]
+    values = np.concatenate([*known, np.zeros(0)])
+    if not len(values):
+        return
+    low, high = values.min(), values.max()
+    room = (high - low) / 3 or abs(high) / 10 or 1.0
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(max(bottom, low - room), min(top, high + room))
+
+
 def save(figure: Any, path: Path) -> Path:
-    """Writes a picture whose bytes depend on what it shows alone."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata=_METADATA[path.suffix])
+    """Writes a figure to a file; its bytes depend on what it shows alone."""
+    own_folder(path.parent)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, metadata=_METADATA[path.suffix])
     return path
+
+
+def as_svg(figure: Any) -> bytes:
+    """Draws a figure as SVG; its bytes depend on what it shows alone.
+
+    Coordinates keep two decimals of a point, which halves a page of many panels.
+    """
+    file = io.BytesIO()
+    figure.savefig(file, format="svg", metadata=_METADATA[".svg"])
+    return re.sub(rb"(\d\.\d\d)\d+", rb"\1", file.getvalue())

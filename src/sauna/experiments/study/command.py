@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import signal
@@ -13,18 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import COMPARED_SEEDS, algorithm_of, chosen_preset
-from sauna.config.settings import Config
+from sauna.config.trust import check_trusted, covers, seal
 from sauna.envs.probe import Probe
-from sauna.envs.spaces import Spaces
 from sauna.experiments.report.numbers import digits_of_tasks, interval, number
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
+from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
-from sauna.experiments.study.summary import FILTERING, summarize
+from sauna.experiments.study.summary import ABLATION, summarize
 from sauna.experiments.study.units import (
     Unit,
     digest_of,
@@ -36,11 +35,12 @@ from sauna.experiments.study.units import (
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
+from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import examine, look_at, place
 
 
 def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
-    """The study that `sauna compare ENV` runs: its folder is named after its settings.
+    """Returns the study that `sauna compare ENV` runs: its folder is named after its settings.
 
     Raises:
       BadInput: unknown arms or settings that cannot be used.
@@ -61,13 +61,13 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
 def compare_command(
     env: str, arms: tuple[str, ...], settings: Mapping[str, Any], out: str | Path
 ) -> str:
-    """What a user types to make the same comparison again."""
+    """Returns what a user types to make the same comparison again."""
     flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
     return f"sauna compare {shlex.quote(env)} --arms {','.join(arms)}{flags}{_typed_out(out)}"
 
 
 def study_command(name: str, out: str | Path) -> str:
-    """What a user types to run the study again."""
+    """Returns what a user types to run the study again."""
     return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
 
 
@@ -83,6 +83,7 @@ def study(
     on: str = "local",
     address: str = "",
     quiet: bool = False,
+    accept_changed_code: bool = False,
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
@@ -96,6 +97,7 @@ def study(
       on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
       address: of the cluster.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
 
     Returns:
       the summary.
@@ -113,13 +115,17 @@ def study(
         ray_cluster.check(address)
     elif address:
         raise BadInput("address: read with --on ray only")
-    _check_runs(spec)
+    out = Path.cwd() / out  # an environment may go elsewhere
+    with kept_folder():
+        _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
-        return _train(LocalExecutor, spec, out, command, jobs, command, quiet)
+        return _train(LocalExecutor, spec, out, command, jobs, command, quiet, accept_changed_code)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with ray_cluster.connected(address, jobs) as jobs:
-        return _train(ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet)
+        return _train(
+            ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet, accept_changed_code
+        )
 
 
 def _check_runs(spec: Spec) -> None:
@@ -140,23 +146,10 @@ def _check_runs(spec: Spec) -> None:
                 found[key] = look_at(config)
             try:
                 prepared = examine(placed, arm.checked_overrides(task), found[key])
-                _check_measurable(spec, prepared.config, prepared.spaces)
+                if spec.measurement:
+                    spec.measurement.check_spaces(prepared.config, prepared.spaces)
             except BadInput as error:
                 raise BadInput(f"arm {arm.label!r}: {error}") from None
-
-
-def _check_measurable(spec: Spec, config: Config, spaces: Spaces) -> None:
-    """Refuses what only an environment's spaces tell of a measurement."""
-    if spec.measure == "dial" and not config.normalize_observations:
-        raise BadInput(
-            "measure: dial takes its scale from the normaliser of observations, which "
-            f"{config.env} does not have"
-        )
-    if spec.measure == "noise" and spaces.observation_kind == "image":
-        raise BadInput(
-            "measure: noise keeps rollouts of observations in memory, which pictures "
-            "are too large for"
-        )
 
 
 def _on_gpu(spec: Spec) -> bool:
@@ -173,14 +166,17 @@ def _train(
     jobs: int,
     again: str,
     quiet: bool,
+    accept_changed_code: bool,
 ) -> dict[str, Any]:
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
     size = _unit_size(spec, place, jobs)
-    with _held(folder):
+    with _locked(folder):
         _note(spec, place, size)
         units = units_of(spec, size)
+        check_same_code(units, folder, accept_changed_code)
         view = StudyView(spec, units, folder, quiet)
+        reopen_damaged(units, folder, view.say)
         members = sum(len(unit.seeds) for unit in units)
         view.say(
             f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
@@ -221,8 +217,8 @@ def _note_signal(noted: list[int], number: int) -> None:
 
 
 @contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """The folder of units, made and held: one study at a time."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Makes and locks the folder of units: one study at a time."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -241,10 +237,13 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
     if place.exists() and not place.is_dir():
         raise BadInput(f"out: {place} is no folder")
     if path.is_file():
-        stored = json.loads(path.read_text())
-        if not _is_same(stored["study"], spec):
+        stored = run_directory.read_config_file(path)
+        text, size = stored.get("study"), stored.get("seeds_per_unit")
+        if not isinstance(text, dict) or not isinstance(size, int) or size < 1:
+            raise BadInput(f"out: {path} is not what a study writes")
+        if not covers(spec.text, text) or not _is_same(text, spec):
             raise BadInput(f"study: {place} holds another study of this name; give --out")
-        return int(stored["seeds_per_unit"])
+        return size
     return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
 
 
@@ -254,7 +253,20 @@ def _note(spec: Spec, place: Path, size: int) -> None:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
-    run_directory.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+    run_directory.write_json(
+        place / "study.json", {"study": spec.text, "seeds_per_unit": size, "seal": seal(spec.text)}
+    )
+
+
+def check_study(text: Mapping[str, Any], out: Path, trust: bool) -> None:
+    """Refuses code that a study's file names, unless this user has run it before.
+
+    Raises:
+      BadInput: with everything that is named.
+    """
+    path = out / str(text["name"]) / "study.json"
+    stored = run_directory.read_config_file(path) if path.is_file() else {}
+    check_trusted(text, f"study {text['name']!r}", stored.get("seal"), trust)
 
 
 def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:
@@ -267,46 +279,38 @@ def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:
 
 def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str) -> dict[str, Any]:
     """Gathers what there is and writes `results.json`, `summary.json`, the report and figures."""
-    from sauna.experiments.measure import coverage_report, noise_report, posture_report
     from sauna.experiments.report.figures import NOTHING
     from sauna.experiments.study.report import write_report
 
     results = gather(spec, units, folder, command)
     summary = summarize(results)
-    extra = NOTHING
-    if spec.measure:
+    section = NOTHING
+    if measurement := spec.measurement:
         measured = gather_measured(spec, units, folder, place, results)
-        run_directory.write_json(place / f"{spec.measure}.json", measured)
-        study = {"noise": noise_report, "dial": coverage_report, "torso": posture_report}[
-            spec.measure
-        ]
-        summary["measured"] = study.verdicts(measured)
+        run_directory.write_json(place / f"{measurement.name}.json", measured)
+        section = measurement.report(measured, place)
+        summary["measured"] = list(section.answers)
         summary["not_measured"] = sum(
             not item.is_done for item in items_of(spec, units, folder, place)
         )
-        extra = (
-            posture_report.extra(measured, place)
-            if study is posture_report
-            else study.extra(measured)
-        )
     run_directory.write_json(place / "results.json", results)
     run_directory.write_json(place / "summary.json", summary)
-    write_report(results, summary, place, extra)
+    write_report(results, summary, place, section)
     return summary
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
-    """The table and the verdicts, as text."""
+    """Returns the table and the verdicts, as text."""
     head = [
         "task",
         "arm",
         "seeds",
         "final return, IQM",
-        "area, IQM",
+        "AUC, IQM",
         "mean +- std",
         "keep rate",
         "env steps",
-        "P(better)",
+        "P(improvement)",
     ]
     digits = digits_of_tasks(summary["table"])
     rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
@@ -314,7 +318,8 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
     said = [v["text"] for v in summary["verdicts"]]
     if summary["filtering"]:
-        said += ["", "Is it the filter? " + FILTERING, *(v["text"] for v in summary["filtering"])]
+        ablation = "Ablation of the selection rule. " + ABLATION
+        said += ["", ablation, *(v["text"] for v in summary["filtering"])]
     said += summary.get("measured", [])
     return [*(line.rstrip() for line in table), "", *said]
 
@@ -327,7 +332,7 @@ def _row(row: Mapping[str, Any], digits: int) -> list[str]:
         row["label"],
         f"{row['seeds']}{failed}",
         interval(row["final_iqm"], digits),
-        interval(row["area_iqm"], digits),
+        interval(row["auc_iqm"], digits),
         f"{mean} +- {std}",
         number(row["keep_rate"], 3),
         number(row["env_steps"], 0),

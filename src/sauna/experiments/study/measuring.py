@@ -17,15 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.experiments.curves import area_under_curve
+from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.study.execute.process import Message, UnitProcess
-from sauna.experiments.study.spec import Spec, check, drops_nothing
+from sauna.experiments.study.spec import Spec, check
 from sauna.experiments.study.units import Unit, parts
 from sauna.system import run_directory
 from sauna.system.checkpoint import numbered
 
-# Shares of the budget at which each measurement is made, at the checkpoint nearest to it.
-ALONG = (0.05, 0.25, 0.5, 0.75, 1.0)
-POINTS = {"noise": ALONG, "dial": ALONG, "torso": (1.0,)}
 SETTINGS = ("threshold", "threshold_schedule", "keep_rate_target")  # that a cell is known by
 
 
@@ -37,7 +35,7 @@ class Item(NamedTuple):
     arm: str
     seed: int
     run: Path
-    points: list[float]  # of the measurement's `POINTS`, those that have a checkpoint of their own
+    points: list[float]  # of the measurement's points, those that have a checkpoint of their own
     iterations: list[int]
     files: list[Path]
 
@@ -47,12 +45,12 @@ class Item(NamedTuple):
 
 
 def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> list[Item]:
-    """Every complete member that can be measured.
+    """Returns every complete member that can be measured.
 
     What is measured in a scale belongs to the scale's checkpoint as well.
     """
     items = list(_items(spec, units, folder, place))
-    if spec.measure != "dial":
+    if not _measurement(spec).scaled:
         return items
     scales = {task: scale_of(spec, items, task) for task in spec.tasks}
     marks = {
@@ -68,22 +66,21 @@ def items_of(spec: Spec, units: list[Unit], folder: Path, place: Path) -> list[I
 
 
 def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator[Item]:
-    assert spec.measure is not None
+    measurement = _measurement(spec)
     for arm in spec.arms:
         for unit in (unit for unit in units if unit.label == arm.label):
             config = check(arm, unit.task)
-            if spec.measure == "noise" and drops_nothing(config):
+            if not measurement.applies(config):
                 continue
             for part in parts(unit, folder):
                 if not part.is_complete(folder):
                     continue
                 run = part.run(folder)
                 for seed in part.seeds:
-                    points = POINTS[spec.measure]
-                    chosen = checkpoints_at(run, seed, config.steps, points)
+                    chosen = checkpoints_at(run, seed, config.steps, measurement.points)
                     name = f"{part.name.replace('/', '_')}_{seed}"
                     files = [
-                        place / spec.measure / f"{name}_{i:08d}_{_mark(run, i)}.json"
+                        measurement.folder(place) / f"{name}_{i:08d}_{_mark(run, i)}.json"
                         for i in chosen.values()
                     ]
                     yield Item(
@@ -99,13 +96,14 @@ def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator
 
 
 def _mark(run: Path, iteration: int) -> str:
-    """Eight digits that tell a checkpoint from another of the same number."""
+    """Eight digits that differ between checkpoints of the same number."""
     manifest = run / "checkpoints" / f"{iteration:08d}" / "manifest.json"
     return hashlib.sha256(manifest.read_bytes() if manifest.exists() else b"").hexdigest()[:8]
 
 
 def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) -> dict[float, int]:
-    """`{point: iteration}`: the checkpoint of a seed nearest to each point, none of them twice."""
+    """Returns `{point: iteration}`: the checkpoint of a seed nearest to each point, none of them
+    twice."""
     rows = [row for row in run_directory.rows(run) if row["seed"] == seed]
     reached = {
         int(path.name): max(
@@ -122,7 +120,8 @@ def checkpoints_at(run: Path, seed: int, steps: int, points: tuple[float, ...]) 
 
 
 def scale_of(spec: Spec, items: list[Item], task: str) -> dict[str, Any] | None:
-    """Whose normaliser scales the observations of all arms: the baseline's first seed at its end.
+    """Returns whose normaliser scales the observations of all arms: the baseline's first seed at
+    its end.
 
     None while that is not trained. It is never another seed, so that all measurements, early and
     late ones, have one scale.
@@ -146,11 +145,12 @@ def measure(
 ) -> None:
     """Makes what is missing of a study's measurements, `jobs` members at a time on this machine.
 
-    A member whose measurement fails is told and left out; the study, run again, tries it again.
+    A member whose measurement fails is reported and left out; the study, run again, tries it again.
     """
+    measurement = _measurement(spec)
     items = items_of(spec, units, folder, place)
     scales = {}
-    if spec.measure == "dial":
+    if measurement.scaled:
         scales = {task: scale_of(spec, items, task) for task in spec.tasks}
         for task in (task for task, scale in scales.items() if scale is None):
             say(
@@ -161,8 +161,8 @@ def measure(
     waiting = [item for item in items if not item.is_done]
     if not waiting or stopping():
         return
-    (place / str(spec.measure)).mkdir(exist_ok=True)
-    say(f"measuring {spec.measure}: {len(waiting)} members")
+    measurement.folder(place).mkdir(exist_ok=True)
+    say(f"measuring {measurement.name}: {len(waiting)} members")
     messages: queue.SimpleQueue[tuple[Item, Message | None]] = queue.SimpleQueue()
     running: dict[Path, UnitProcess] = {}
     try:
@@ -171,7 +171,9 @@ def measure(
                 return
             while waiting and len(running) < jobs:
                 item = waiting.pop(0)
-                running[item.files[0]] = _start(spec, item, scales.get(item.task), place, messages)
+                running[item.files[0]] = _start(
+                    measurement, item, scales.get(item.task), place, messages
+                )
             try:
                 item, message = messages.get(timeout=0.2)
             except queue.Empty:
@@ -181,7 +183,7 @@ def measure(
                     say(f"{_named(item)}: {message['error']}")
                 continue
             how = running.pop(item.files[0]).end()
-            log = place / str(spec.measure) / "stderr.txt"
+            log = measurement.folder(place) / "stderr.txt"
             say(f"{_named(item)}: {'measured' if item.is_done else f'{how}; see {log}'}")
     finally:
         for process in running.values():
@@ -194,21 +196,21 @@ def _named(item: Item) -> str:
 
 
 def _start(
-    spec: Spec,
+    measurement: Measurement,
     item: Item,
     scale: dict[str, Any] | None,
     place: Path,
     messages: queue.SimpleQueue[tuple[Item, Message | None]],
 ) -> UnitProcess:
     given = {
-        "what": spec.measure,
+        "compute": measurement.compute,
         "run": str(item.run),
         "member": f"{item.arm}/{item.seed}",
         "iterations": item.iterations,
         "files": [str(file) for file in item.files],
         "scale": scale,
     }
-    log = place / str(spec.measure) / "stderr.txt"
+    log = measurement.folder(place) / "stderr.txt"
     return UnitProcess(
         given,
         log,
@@ -220,12 +222,14 @@ def _start(
 def gather_measured(
     spec: Spec, units: list[Unit], folder: Path, place: Path, results: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What has been measured so far, beside the numbers of `results` that it is set against.
+    """Returns what has been measured so far, beside the numbers of `results` that it is compared
+    with.
 
     Every cell of `results` that can be measured is there, and of each complete member its
     `points`: none of a member whose later checkpoints are still to be measured, since early ones
     alone would pass for all.
     """
+    measurement = _measurement(spec)
     points: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for item in items_of(spec, units, folder, place):
         points[item.task, item.label, item.seed] = [
@@ -244,13 +248,12 @@ def gather_measured(
                 "entropy": mean_over_training(member["curve"], "entropy"),
                 "threshold": usual(member["curve"], "threshold"),
                 "points": points[*key, member["seed"]],
-                **({"curve": explained(member["curve"])} if spec.measure == "torso" else {}),
+                **_curves(member["curve"], measurement.curves),
             }
             for member in cell["members"]
             if (*key, member["seed"]) in points
         ]
-        nothing = spec.measure == "noise" and drops_nothing(check(arms[key[1]], key[0]))
-        if not nothing:
+        if measurement.applies(check(arms[key[1]], key[0])):
             settings = {name: config[name] for name in SETTINGS}
             cells.append(
                 {
@@ -274,18 +277,24 @@ def gather_measured(
     }
 
 
-def explained(curve: Mapping[str, Any]) -> dict[str, Any]:
-    """The explained variance over training, of a curve of `results`."""
-    return {name: curve[name] for name in ("env_steps", "explained_variance")}
+def _measurement(spec: Spec) -> Measurement:
+    assert spec.measurement is not None
+    return spec.measurement
+
+
+def _curves(curve: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    """The named curves of a member of `results`, as an entry; none if no name is given."""
+    return {"curve": {name: curve[name] for name in ("env_steps", *names)}} if names else {}
 
 
 def mean_over_training(curve: Mapping[str, Any], name: str) -> float | None:
-    """A curve's mean over env steps; None where it has no values."""
+    """Returns a curve's mean over env steps; None where it has no values."""
     return area_under_curve(np.array(curve["env_steps"], float), _values(curve, name))
 
 
 def usual(curve: Mapping[str, Any], name: str) -> float | None:
-    """A curve's median: a held threshold is far off where the median prediction is near 0."""
+    """Returns a curve's median: a threshold that keeps a target rate is far off if the median is
+    near 0."""
     values = _values(curve, name)
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None

@@ -24,7 +24,7 @@ def _underpowered(task: str, baseline: Arm, family: list[Arm]) -> list[str]:
     """Tries the test with every score of an arm above every score of its baseline."""
     low = np.arange(len(baseline.seeds), dtype=float)
     found = compare({arm.label: (low[-1] + 1.0 + np.arange(len(arm.seeds)), low) for arm in family})
-    short = {label: result for label, result in found.items() if result.kind == "too few"}
+    short = {label: result for label, result in found.items() if result.kind == "underpowered"}
     if not short:
         return []
     needed = max(result.least for result in short.values())

@@ -31,7 +31,7 @@ DIGITS = 6  # significant digits of a curve's points
 
 
 def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[str, Any]:
-    """Everything that is known, one entry per trained member; see `docs/studies.md`."""
+    """Gathers everything that is known, one entry per trained member."""
     cells = [
         _cell(arm, task, [u for u in units if (u.label, u.task) == (arm.label, task)], folder)
         for task in spec.tasks
@@ -57,7 +57,7 @@ def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
     for unit in units:
         for part in parts(unit, folder):
             path = part.run(folder) / "config.json"
-            stored = json.loads(path.read_text()) if path.is_file() else {}
+            stored = run_directory.read_config_file(path) if path.is_file() else {}
             for name, values in found.items():
                 if name in stored and stored[name] not in values:
                     values.append(stored[name])
@@ -87,7 +87,8 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
 
 
 def typed(name: str, value: Any) -> str:
-    """A setting as it is typed; one seed ends in a comma, without which it would be a count."""
+    """Returns a setting as it is typed; one seed ends in a comma, without which it would be a
+    count."""
     if isinstance(value, bool):
         return flag(name) if value else flag("no_" + name)
     if isinstance(value, list | tuple):
@@ -118,7 +119,7 @@ def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
 def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
     """A member's last numbers and its thinned curve.
 
-    The area is that of the first `budget` env steps, also where kept steps are counted and a member
+    The AUC is that of the first `budget` env steps, also if kept steps are counted and a member
     takes more env steps.
     """
     last = rows[-1] if rows else {}
@@ -128,7 +129,7 @@ def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
     kept, tried = last.get("kept_steps"), last.get("env_steps")
     return {
         "final_return": last.get("return_mean"),
-        "area": area_under_curve(steps[within], returns[within]),
+        "auc": area_under_curve(steps[within], returns[within]),
         "env_steps": tried,
         "kept_steps": kept,
         "keep_rate": kept / tried if kept is not None and tried else None,

@@ -14,18 +14,20 @@
     threshold = 0.8
 
 Any setting of a run may stand at the top, for all arms, or in an arm. `baseline` is the label that
-others are compared with. `measure` names what is measured of the trained members: `noise` or
-`dial` at checkpoints along their training, `torso` (of HalfCheetah) at its end. An arm may name its
-own `tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured drop rates of the arm
+others are compared with. `question` is the title of the report. `measure` names what is measured of
+the trained members: `noise` or `coverage` at checkpoints along their training, `posture` (of
+HalfCheetah) at its end, or a `Measurement` of your own as `module:name`. An arm may name its own
+`tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured drop rates of the arm
 `rates_of`.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import string
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,12 +42,19 @@ from sauna.config.presets import (
     resolve_run,
 )
 from sauna.config.settings import FIELDS, Config, fields_with, parse, to_json
+from sauna.experiments.measure.measurement import (
+    Measurement,
+    check_measurement,
+    current_name,
+    find_measurement,
+)
 from sauna.system.errors import BadInput, nearest
+from sauna.system.safe_read import JSON_BYTES, Untrusted, read_file
 
 _OWN = (*fields_with("decided_by_study"), "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
-_TOP = ("name", "tasks", "seeds", "baseline", "arms", "measure")
-MEASURES = ("noise", "dial", "torso")
+_TOP = ("name", "question", "tasks", "seeds", "baseline", "arms", "measure")
+FORMER_STUDIES = {"dial": "threshold-sweep"}  # names in 0.1.0
 _ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
 
 
@@ -77,7 +86,11 @@ class Spec(NamedTuple):
     baseline: str
     arms: list[Arm]
     text: dict[str, Any]
-    measure: str | None = None  # what is measured of the members once they are trained
+    measure: str | None = None  # names the measurement of the trained members
+
+    @property
+    def measurement(self) -> Measurement | None:
+        return find_measurement(self.measure) if self.measure else None
 
     @property
     def tasks(self) -> list[str]:
@@ -85,7 +98,7 @@ class Spec(NamedTuple):
 
 
 def read_spec(values: Mapping[str, Any]) -> Spec:
-    """The study that `values` describe.
+    """Reads the study that `values` describe.
 
     Raises:
       BadInput: an unknown key, a label twice or unknown, or settings that cannot be used.
@@ -115,15 +128,28 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
             raise BadInput(f"study: the label {label!r} is given twice")
     baseline = _text(values.get("baseline", labels[0]), "baseline")
     arms = [_settle(arm, arms, baseline) for arm in arms]
-    spec = Spec(name, baseline, arms, _plain(values), values.get("measure"))
+    if "question" in values:
+        _text(values["question"], "question")
+    measure = values.get("measure")
+    if isinstance(measure, str):
+        measure = current_name(measure)
+    spec = Spec(name, baseline, arms, _plain(values), measure)
     configs = [check(arm, task) for arm in arms for task in arm.tasks]
-    if spec.measure is not None:
-        _check_measure(spec.measure, configs)
-    if spec.measure == "dial":  # whose scale is the baseline's
-        scaled = next(arm.tasks for arm in arms if arm.label == baseline)
-        if missing := set(spec.tasks) - set(scaled):
-            raise BadInput(f"study: dial needs {baseline!r} on {', '.join(sorted(missing))}, too")
+    if measure is not None:
+        _check_measure(spec, find_measurement(measure), configs)
     return spec
+
+
+def _check_measure(spec: Spec, measurement: Measurement, configs: list[Config]) -> None:
+    """Refuses a study that cannot be measured, or whose scale would be missing."""
+    check_measurement(measurement, configs)
+    if measurement.scaled:
+        scaled = next(arm.tasks for arm in spec.arms if arm.label == spec.baseline)
+        if missing := set(spec.tasks) - set(scaled):
+            raise BadInput(
+                f"study: {measurement.name} needs {spec.baseline!r} on "
+                f"{', '.join(sorted(missing))}, too"
+            )
 
 
 def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, Any]) -> Arm:
@@ -154,7 +180,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
 
 
 def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
-    """Whether a run of `arm` with these settings takes the setting `key` at all."""
+    """Returns whether a run of `arm` with these settings takes the setting `key` at all."""
     config = arm_config(arm, parse_all(settings))
     return is_read(key, config) and key not in FIXED.get(arm, ())
 
@@ -166,44 +192,6 @@ def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:
             raise BadInput(
                 f"study: {key} is read by none of the arms {', '.join(arm.label for arm in arms)}"
             )
-
-
-def _check_measure(measure: Any, configs: list[Config]) -> None:
-    """Refuses a measurement that is not known or would lack what it needs."""
-    if measure not in MEASURES:
-        raise BadInput(
-            f"study: measure must be one of {', '.join(MEASURES)}, not {measure!r}"
-            f"{nearest(str(measure), MEASURES)}"
-        )
-    for config in configs:
-        rollout = config.rollout_steps * config.envs
-        kept = config.keep_checkpoints * config.checkpoint_every * rollout
-        if measure != "torso" and kept < config.steps:
-            every = min(config.checkpoint_every, -(-config.steps // (100 * rollout)))
-            raise BadInput(
-                "keep_checkpoints: measure needs the checkpoints along training; set "
-                f"checkpoint_every = {every} and keep_checkpoints = "
-                f"{-(-config.steps // (every * rollout))}"
-            )
-        if config.backend == "device":
-            raise BadInput("backend: measure needs environments on the host")
-        coin = config.filter == "random-drop" and config.drop_rate_from
-        if measure == "dial" and config.filter != "sauna" and not coin:
-            raise BadInput(
-                'study: measure = "dial" is of arms that have a threshold, and of coins '
-                f"that repeat their rates, not of {', '.join(config.arm)}"
-            )
-        if measure == "torso" and not config.env.startswith("HalfCheetah"):
-            raise BadInput(f'study: measure = "torso" is of HalfCheetah, not of {config.env}')
-        if measure == "dial" and not config.normalize_observations:
-            raise BadInput("normalize_observations: dial takes its scale from the normaliser")
-    if measure == "noise" and all(map(drops_nothing, configs)):
-        raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
-
-
-def drops_nothing(config: Config) -> bool:
-    """Whether there is nothing dropped to measure, or no advantage of what is dropped."""
-    return config.filter == "none" or config.gae_over == "kept"
 
 
 def _text(value: Any, key: str) -> str:
@@ -243,15 +231,15 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
     return arm._replace(baseline=own, rates_of=source)
 
 
-def _rules_of(source: Arm, coin: Arm) -> dict[str, Any]:
-    """The rules of a filtered arm that a coin which repeats its drop rates has to share."""
-    theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, coin))
+def _rules_of(source: Arm, control: Arm) -> dict[str, Any]:
+    """Returns the rules of a filtered arm that its matched random control has to share."""
+    theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, control))
     shared = fields_with("rule_of_experiment")
-    rules = {name: theirs[name] for name in shared if name not in FIXED[coin.arm]}
+    rules = {name: theirs[name] for name in shared if name not in FIXED[control.arm]}
     return {
         name: theirs[name]
         for name in rules
-        if theirs[name] != own[name] and reads(coin.arm, {**coin.settings, **rules}, name)
+        if theirs[name] != own[name] and reads(control.arm, {**control.settings, **rules}, name)
     }
 
 
@@ -279,28 +267,33 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
         raise BadInput(f"study: {error}") from None
 
 
-def load_spec(name: str) -> Spec:
-    """A study of this package by name, or one in a TOML file.
+def load_spec(name: str, check: Callable[[Mapping[str, Any]], None] = lambda text: None) -> Spec:
+    """Loads a study of this package by name, or one in a TOML file.
+
+    Args:
+      check: refuses what a file says, before anything of it is imported.
 
     Raises:
       BadInput: there is no such study or file, or it cannot be read.
     """
     known = built_in()
-    if name in known:
-        return read_spec(tomllib.loads(known[name]))
+    current = FORMER_STUDIES.get(name, name)
+    if current in known:  # under a former name it goes on in the folder of that name
+        return read_spec({**tomllib.loads(known[current]), "name": name})
     path = Path(name)
-    if not path.is_file():
+    if not os.path.lexists(path):
         listed = ", ".join(known)
         raise BadInput(f"study: no study or file {name!r} (known: {listed}){nearest(name, known)}")
     try:
-        values = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        values = tomllib.loads(read_file(Path(os.path.realpath(path)), JSON_BYTES).decode())
+    except (Untrusted, ValueError, RecursionError) as error:
         raise BadInput(f"study: cannot read {path}: {error}") from error
+    check({"name": path.stem, **values})
     return read_spec({"name": path.stem, **values})
 
 
 def built_in() -> dict[str, str]:
-    """The studies of this package: `{name: text}`."""
+    """Returns the studies of this package: `{name: text}`."""
     folder = resources.files("sauna.experiments.study") / "studies"
     return {
         entry.name.removesuffix(".toml"): entry.read_text()

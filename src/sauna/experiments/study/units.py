@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, to_json
 from sauna.experiments.study.spec import Arm, Spec, check
 from sauna.system import run_directory
@@ -38,7 +39,7 @@ class Unit(NamedTuple):
     source: str | None
 
     def run(self, folder: Path) -> Path:
-        """The run directory."""
+        """Returns the run directory."""
         return folder / self.name / "run"
 
     def overrides(self, folder: Path) -> dict[str, Any]:
@@ -49,17 +50,18 @@ class Unit(NamedTuple):
         return overrides
 
     def error(self, folder: Path) -> str | None:
-        """Why it failed for good, or None."""
+        """Returns why it failed for good, or None."""
         path = folder / self.name / "failed.json"
-        return str(json.loads(path.read_text())["error"]) if path.is_file() else None
+        return str(run_directory.read_config_file(path).get("error")) if path.is_file() else None
 
     def is_complete(self, folder: Path) -> bool:
         return run_directory.is_complete(self.run(folder))
 
 
 def seeds_per_unit(spec: Spec, cores: int) -> int:
-    """As many as share a process well, or fewer where cores would stay idle at the start, when arms
-    that repeat others' drop rates have to wait; as even as can be without another unit."""
+    """Returns as many as share a process well, or fewer where cores would stay idle at the start,
+    when arms that repeat others' drop rates have to wait; as even as can be without another
+    unit."""
     first = [arm for arm in spec.arms if arm.rates_of is None]
 
     def units(size: int) -> int:
@@ -70,12 +72,13 @@ def seeds_per_unit(spec: Spec, cores: int) -> int:
 
 
 def most_seeds(spec: Spec) -> int:
-    """All seeds of an arm: a GPU trains them in little more time than one."""
+    """Returns all seeds of an arm: a GPU trains them in little more time than one."""
     return max(len(arm.seeds) for arm in spec.arms)
 
 
 def units_of(spec: Spec, size: int) -> list[Unit]:
-    """All units of `size` seeds at most, arm by arm, a source before those that repeat it."""
+    """Returns all units of `size` seeds at most, arm by arm, a source before those that repeat
+    it."""
     arms = {arm.label: arm for arm in spec.arms}
     ordered = sorted(spec.arms, key=lambda arm: arm.rates_of is not None)
     return [
@@ -101,14 +104,17 @@ def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> 
 
 
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
-    """What of a run's config differs from the defaults: the same for the same training."""
+    """What of a run's config differs from the defaults: the same for the same training.
+
+    The defaults are those of when units got their names.
+    """
     config = to_json(check(arm._replace(seeds=seeds), task))
-    usual = {**to_json(Config()), "arm": ["sauna"]}  # its default when units got their names
+    usual = {**to_json(Config()), **BEFORE, "arm": ["sauna"]}
     return {name: value for name, value in config.items() if value != usual[name]}
 
 
 def study_identity(spec: Spec) -> list[Any]:
-    """Everything that a study trains and compares: the same for the same study."""
+    """Returns everything that a study trains and compares: the same for the same study."""
     return [
         [arm.label, arm.baseline, arm.rates_of, identity(arm, task, arm.seeds)]
         for arm in spec.arms
@@ -117,12 +123,13 @@ def study_identity(spec: Spec) -> list[Any]:
 
 
 def digest_of(values: Any) -> str:
-    """A name for JSON values."""
+    """Returns a name for JSON values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
 def split(unit: Unit, folder: Path) -> list[Unit]:
-    """A unit of several seeds as units of one: so that the others go on where one failed."""
+    """Returns a unit of several seeds as units of one: so that the others go on where one
+    failed."""
     source_is_split = unit.source is not None and _is_split(folder / unit.source)
     return [
         unit._replace(
@@ -146,11 +153,11 @@ def _is_split(place: Path) -> bool:
 
 
 def parts(unit: Unit, folder: Path) -> list[Unit]:
-    """The units that hold the runs: the unit itself, or one per seed where it was split."""
+    """Returns the units that hold the runs: the unit itself, or one per seed where it was split."""
     is_split = _is_split(folder / unit.name) and not unit.is_complete(folder)
     return split(unit, folder) if is_split else [unit]
 
 
 def needs_split(unit: Unit, folder: Path) -> bool:
-    """Whether its source was split, so that it has to follow."""
+    """Returns whether its source was split, so that it has to follow."""
     return len(unit.seeds) > 1 and unit.source is not None and _is_split(folder / unit.source)

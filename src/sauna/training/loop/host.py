@@ -102,10 +102,11 @@ def make_envs(job: Job) -> HostEnvs:
     seeds = [(member.seed, n) for member in job.members for n in range(config.envs)]
     if config.env_processes:
         processes = min(config.env_processes, len(seeds))
-        return ProcessEnvs(
-            config.env, job.env_kwargs, seeds, processes, config.env_timeout, config.backend
-        )
-    return in_process_envs(config.env, job.env_kwargs, seeds, config.backend)
+        how = config.env_timeout, config.backend, config.rescale_actions
+        return ProcessEnvs(config.env, job.env_kwargs, seeds, processes, *how)
+    return in_process_envs(
+        config.env, job.env_kwargs, seeds, config.backend, config.rescale_actions
+    )
 
 
 def _start(

@@ -1,5 +1,5 @@
 "use strict";
-// What the scripts of all pages draw with.
+// What the page of `sauna inspect` draws with.
 const draw = (() => {
   const html = (parent, name, attributes = {}, text = null) =>
     add(parent, document.createElement(name), attributes, text);
@@ -15,14 +15,7 @@ const draw = (() => {
   const fixed = (value, digits) =>
     value.toLocaleString("en-US", { minimumFractionDigits: digits, maximumFractionDigits: digits })
       .replace("-", "\u2212");
-  /** Decimals that tell apart what is a hundredth of the axis apart. */
-  const digitsOf = ([low, high]) => Math.max(0, 2 - Math.floor(Math.log10(high - low)));
   const number = (value, digits) => value == null ? "-" : fixed(value, digits);
-  function short(value) {
-    for (const [size, suffix] of [[1e9, "G"], [1e6, "M"], [1e3, "k"]])
-      if (Math.abs(value) >= size) return Number((value / size).toPrecision(4)) + suffix;
-    return fixed(value, 0);
-  }
 
   /** Round numbers within [low, high], about `count` of them, and the decimals they need. */
   function ticks(low, high, count) {
@@ -35,7 +28,7 @@ const draw = (() => {
     return { values, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) };
   }
 
-  /** Lowest and highest of the numbers, a little apart where they are one. */
+  /** Lowest and highest of the numbers, a little apart if they are one. */
   function extent(values) {
     let low = Infinity, high = -Infinity;
     for (const value of values) {
@@ -65,5 +58,5 @@ const draw = (() => {
   const path = (xs, ys, X, Y) =>
     stretches(xs, ys).map((points) => joined(points.map(([x, y]) => [X(x), Y(y)]))).join("");
 
-  return { html, svg, fixed, digitsOf, number, short, ticks, extent, stretches, joined, path };
+  return { html, svg, fixed, number, ticks, extent, stretches, joined, path };
 })();

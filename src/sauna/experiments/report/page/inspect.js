@@ -3,7 +3,7 @@
 (() => {
   const { html, svg, fixed, number, ticks, extent, stretches, joined, path } = draw;
   const data = JSON.parse(document.getElementById("data").textContent);
-  const { series, labels, keep, starts, rollouts, points, pictures } = data;
+  const { series, labels, keep, starts, rollouts, points, frames } = data;
   const LAST = keep.length - 1;
   const WINDOW = 200; // env steps that are shown when zoomed
   const EDGE = { top: 6, right: 8, left: 48 };
@@ -37,11 +37,11 @@
 
   let shown = -1;
   function showPicture() {
-    const place = Math.max(0, pictures.rows.findLastIndex((row) => row <= now));
+    const place = Math.max(0, frames.rows.findLastIndex((row) => row <= now));
     if (place === shown) return;
     shown = place;
-    picture.src = "data:image/webp;base64," + pictures.images[place];
-    picture.dataset.row = pictures.rows[place];
+    picture.src = "data:image/webp;base64," + frames.images[place];
+    picture.dataset.row = frames.rows[place];
   }
   if (picture) listeners.push(showPicture);
 

@@ -18,7 +18,7 @@ from sauna.training.display import duration
 PLAIN_SECONDS = 30.0  # between two progress lines where there is no terminal
 LIVE_SECONDS = 0.25
 NAMED = 4  # arms that a progress line names
-RATE_SECONDS = 60.0  # over which env steps per second are told
+RATE_SECONDS = 60.0  # over which env steps per second are shown
 BARS = "▁▂▃▄▅▆▇█"
 WAITING, DONE, FAILED = "·", "✓", "✗"
 
@@ -38,7 +38,8 @@ class Cell:
         self._recent: deque[tuple[float, int]] = deque()  # when rows came, env steps of all seeds
 
     def note(self, row: dict[str, Any], trained: bool) -> None:
-        """A seed's newest row; `trained` unless it is only told again by a run that continues."""
+        """Notes a seed's newest row; `trained` unless it is only repeated by a run that
+        continues."""
         self.latest[row["seed"]] = row
         steps, now = sum(row["env_steps"] for row in self.latest.values()), time.monotonic()
         if not trained or (self._recent and steps < self._recent[-1][1]):
@@ -49,14 +50,16 @@ class Cell:
             self._recent.popleft()
 
     def share(self, seed: int) -> float:
-        """How much of what it can use of its budget a seed has used; 1 once it has ended."""
+        """Returns how much of what it can use of its budget a seed has used; 1 once it has
+        ended."""
         if seed in self.complete | self.failed:
             return 1.0
         row = self.latest.get(seed)
         return min(row[self._budget] / max(self._usable, 1), 1.0) if row else 0.0
 
     def marks(self) -> str:
-        """A character for each seed: waiting, a bar as high as its progress, complete, failed."""
+        """Returns a character for each seed: waiting, a bar as high as its progress, complete,
+        failed."""
         return "".join(map(self._mark, self.seeds))
 
     def _mark(self, seed: int) -> str:
@@ -68,13 +71,13 @@ class Cell:
         return BARS[min(int(share * len(BARS)), len(BARS) - 1)] if seed in self.latest else WAITING
 
     def mean(self, name: str) -> float | None:
-        """Over the seeds that have the number, failed ones left out."""
+        """Returns the mean over the seeds that have the number, failed ones left out."""
         rows = [row for seed, row in self.latest.items() if seed not in self.failed]
         values = [row[name] for row in rows if name in row]
         return sum(values) / len(values) if values else None
 
     def rate(self) -> float | None:
-        """Env steps per second of late."""
+        """Returns env steps per second of late."""
         if not self.running or len(self._recent) < 2:
             return None
         (first, before), (last, after) = self._recent[0], self._recent[-1]
@@ -186,12 +189,12 @@ class StudyView:
     def _named(self) -> str:
         """The arms in training, as text."""
         running = [(key, cell) for key, cell in self._cells.items() if cell.running]
-        told = "".join(
+        shown = "".join(
             f"; {label} on {task} {cell.marks()} return {number(cell.mean('return_mean'), 1)}, "
             f"keep rate {number(cell.mean('keep_rate'), 3)}"
             for (label, task), cell in running[:NAMED]
         )
-        return told + (f"; {len(running) - NAMED} more" if len(running) > NAMED else "")
+        return shown + (f"; {len(running) - NAMED} more" if len(running) > NAMED else "")
 
     def _table(self, whole: bool = False) -> Any:
         """Every arm on every task, or, where they are too many for the terminal, those in training

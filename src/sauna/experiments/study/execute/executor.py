@@ -28,13 +28,13 @@ class Executor(ABC):
     """Runs units, `jobs` at a time; a subclass says where.
 
     A unit that fails is continued once. If it fails again it is split into its seeds, each of which
-    is trained once, as nobody can tell which of them broke it; a seed alone that fails for good is
+    is trained once, as it is unknown which of them broke it; a seed alone that fails for good is
     noted in its `failed.json`.
 
     Args:
       folder: where the units' folders are.
       jobs: units at a time.
-      view: is told of progress.
+      view: receives the progress.
       stopping: whether to end; running units then finish their iteration and save.
     """
 
@@ -112,7 +112,7 @@ class Executor(ABC):
         return unit.source is not None and (self._folder / unit.source / "failed.json").exists()
 
     def _forgive(self, unit: Unit) -> None:
-        """Lets a coin try again whose source no longer counts as failed: somebody removed it."""
+        """Lets a matched random control try again if its source no longer counts as failed."""
         if unit.error(self._folder) == NO_RATES and not self._source_failed(unit):
             (self._folder / unit.name / "failed.json").unlink()
 

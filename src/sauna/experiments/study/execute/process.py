@@ -1,4 +1,4 @@
-"""A unit's process, seen from outside: started, listened to, told to stop."""
+"""A unit's process, seen from outside: started, listened to, asked to stop."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from sauna.system.safe_write import open_grown
+
 Message = dict[str, Any]
 
 
@@ -19,7 +21,7 @@ class UnitProcess:
     Args:
       overrides: the settings of the unit.
       log: what it prints besides its messages is appended there.
-      tell: is called, in a thread of its own, with each message, and with None at the end.
+      receive: is called, in a thread of its own, with each message, and with None at the end.
       environment: of the process; by default ours.
       module: what it runs.
     """
@@ -28,11 +30,11 @@ class UnitProcess:
         self,
         overrides: Mapping[str, Any],
         log: Path,
-        tell: Callable[[Message | None], None],
+        receive: Callable[[Message | None], None],
         environment: Mapping[str, str] | None = None,
         module: str = "sauna.experiments.study.execute.unit_process",
     ) -> None:
-        with log.open("a") as file:
+        with open_grown(log) as file:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", module],
                 stdin=subprocess.PIPE,
@@ -48,18 +50,18 @@ class UnitProcess:
             self._process.stdin.flush()
         except BrokenPipeError:
             pass  # its end is noticed when its output ends
-        threading.Thread(target=self._listen, args=(tell,), daemon=True).start()
+        threading.Thread(target=self._listen, args=(receive,), daemon=True).start()
 
-    def _listen(self, tell: Callable[[Message | None], None]) -> None:
+    def _listen(self, receive: Callable[[Message | None], None]) -> None:
         assert self._process.stdout is not None
         try:
             for line in self._process.stdout:
                 try:
-                    tell(json.loads(line))
+                    receive(json.loads(line))
                 except ValueError:
                     continue  # printed by something else, before the unit took its output over
         finally:
-            tell(None)
+            receive(None)
 
     def stop(self) -> None:
         """Lets it finish its iteration and save; may be called again."""
@@ -75,5 +77,5 @@ class UnitProcess:
         self._process.kill()
 
     def end(self) -> str:
-        """Waits for its end and says how it ended."""
+        """Waits for its end and returns how it ended."""
         return f"its process ended with exit code {self._process.wait()}"

@@ -45,7 +45,7 @@ def check(address: str) -> None:
     if address in ("", "auto"):
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
+    if not host or not port.isdecimal():
         raise BadInput(f"address: {address!r} is neither HOST:PORT, ray://HOST:PORT nor auto")
     try:  # Ray itself would try for minutes
         socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()
@@ -88,7 +88,7 @@ def _start_here(private: Path, jobs: int) -> None:
         (private / "token").touch(mode=0o600)
         (private / "token").write_text(secrets.token_hex(32))
         os.environ["RAY_AUTH_TOKEN_PATH"] = str(private / "token")
-    # On Linux, Ray replaces a loopback address by one that other machines reach, unless it is told
+    # On Linux, Ray replaces a loopback address by one that other machines reach, unless it is set
     # that this is no cluster. The variable has this name everywhere; Ray reads it when imported.
     os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     import ray

@@ -12,7 +12,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from sauna.system import run_directory
+from sauna.system import run_directory, safe_write
 
 LOGS = ("stderr.txt", *(f"run/{name}" for name in run_directory.LOGS))
 CHECKPOINTS = "run/checkpoints"
@@ -28,7 +28,7 @@ class Changes(NamedTuple):
 
 
 def names(place: Path) -> list[str]:
-    """The files of the unit in `place`, without those that are being written."""
+    """Returns the files of the unit in `place`, without those that are being written."""
     found = [place / "stderr.txt", *sorted((place / "run").rglob("*"))]
     relative = [path.relative_to(place) for path in found if path.is_file()]
     return [str(r) for r in relative if not any(part.startswith(".") for part in r.parts)]
@@ -46,7 +46,7 @@ def write(place: Path, files: dict[str, bytes]) -> None:
 
 
 def checkpoints(place: Path) -> list[str]:
-    """The finished checkpoints of the unit in `place`, oldest first."""
+    """Returns the finished checkpoints of the unit in `place`, oldest first."""
     return sorted(p.name for p in (place / CHECKPOINTS).glob("[0-9]" * 8))
 
 
@@ -63,7 +63,7 @@ class Tracker:
         return found.st_mtime_ns, found.st_size
 
     def changes(self) -> Changes:
-        """Everything that changed since the last call; the run may go on meanwhile."""
+        """Returns everything that changed since the last call; the run may go on meanwhile."""
         while True:
             try:
                 return self._changes()
@@ -110,7 +110,7 @@ def _grow(path: Path, start: int, data: bytes) -> None:
     if start == 0:
         _replace_file(path, data)
     elif data:
-        with path.open("r+b") as file:
+        with safe_write.open_grown(path, "r+b") as file:
             file.truncate(start)
             file.seek(start)
             file.write(data)
@@ -120,10 +120,7 @@ def _grow(path: Path, start: int, data: bytes) -> None:
 
 def _replace_file(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.writing")
-    run_directory.write_durably(temporary, data)
-    temporary.replace(path)
-    run_directory.sync_folder(path.parent)
+    safe_write.replace_file(path, data)
 
 
 def _replace_folder(path: Path, files: dict[str, bytes]) -> None:
@@ -131,9 +128,9 @@ def _replace_folder(path: Path, files: dict[str, bytes]) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     for name, data in files.items():
-        run_directory.write_durably(temporary / name, data)
-    run_directory.sync_folder(temporary)
+        safe_write.write_durably(temporary / name, data)
+    safe_write.sync_folder(temporary)
     if path.exists():
         shutil.rmtree(path)
     temporary.rename(path)
-    run_directory.sync_folder(path.parent)
+    safe_write.sync_folder(path.parent)

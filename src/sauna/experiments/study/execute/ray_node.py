@@ -40,7 +40,7 @@ class Hub:
     """An actor between tasks and the study: only the study knows the files, only tasks change them.
 
     A unit's task may be started again while the old one, cut off, still runs: what the old one says
-    is dropped, and it is told to stop.
+    is dropped, and it is asked to stop.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,8 @@ class Hub:
         self._stopping = False
 
     async def begin(self, name: str) -> tuple[int, dict[str, bytes] | None]:
-        """For a task: its attempt, and the files to begin with; None where it should not begin."""
+        """Returns to a task its attempt and the files to begin with; None if it should not
+        begin."""
         self._attempts[name] = attempt = self._attempts.get(name, 0) + 1
         answer = self._answers[name] = asyncio.get_running_loop().create_future()
         await self._said.put(Said(name, True, [], None))
@@ -59,7 +60,7 @@ class Hub:
     async def say(
         self, name: str, attempt: int, messages: list[Message], changes: Changes | None
     ) -> bool:
-        """For a task: whether to stop."""
+        """Returns to a task whether to stop."""
         if attempt != self._attempts[name]:
             return True
         if messages or changes is not None:
@@ -67,7 +68,7 @@ class Hub:
         return self._stopping
 
     async def take(self, seconds: float) -> list[Said]:
-        """For the study: everything that was said, after `seconds` at the latest."""
+        """Returns to the study every message, after `seconds` at the latest."""
         try:
             taken = [await asyncio.wait_for(self._said.get(), seconds)]
         except TimeoutError:
@@ -77,13 +78,13 @@ class Hub:
         return taken
 
     async def answer(self, name: str, files: dict[str, bytes] | None) -> None:
-        """For the study: what a task begins with."""
+        """Sets for the study what a task begins with."""
         answer = self._answers.pop(name, None)
         if answer is not None and not answer.done():
             answer.set_result(files)
 
     async def stop(self) -> None:
-        """For the study: every task is to finish its iteration and save."""
+        """Asks every task to finish its iteration and save."""
         self._stopping = True
 
 
@@ -163,5 +164,5 @@ def _environment() -> dict[str, str]:
 
 
 def version() -> tuple[str, str]:
-    """Where it runs: the machine's name, and this package's version."""
+    """Returns the machine's name and this package's version."""
     return platform.node(), __version__

@@ -1,0 +1,262 @@
+"""What a comparison of two arms supports, in a sentence that claims no more than its test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sauna.config.presets import arm_settings
+from sauna.config.settings import Config
+from sauna.experiments.statistics import ALPHA, POWER, Comparison, compare
+from sauna.experiments.study.cells import MAX_FAILED, Cell
+from sauna.system.errors import BadInput
+
+# Settings that two arms may differ in and yet differ in the choice of steps alone.
+FILTERS_OWN = (
+    "arm",
+    "seeds",
+    "out",
+    "processes",
+    "filter",
+    "threshold",
+    "threshold_schedule",
+    "keep_rate_target",
+    "history",
+    "decision",
+    "dropped",
+    "max_env_steps_factor",
+    "drop_rate",
+    "drop_rate_from",
+)
+UNFILTERED = 0.99  # mean keep rate from which a difference is not credited to filtering
+MORE_STEPS = 0.01  # relative difference in env steps from which it is mentioned
+ABLATION = (
+    "Each arm that selects steps against those that differ from it in the selection rule alone: "
+    "the head-only ablation, which trains the head and drops nothing, and the matched random "
+    "control, which drops as many steps at random."
+)
+MANY_SEEDS = 1000  # no estimate of a number of seeds is worth more digits
+
+
+def verdicts_of(
+    cells: Sequence[Cell], found: Mapping[str, Comparison], tasks: int
+) -> list[dict[str, Any]]:
+    """Writes the verdict of each arm of a task against its baseline.
+
+    Args:
+      found: the comparison of each label that has a baseline.
+      tasks: how many the study has.
+    """
+    of_label = {cell.label: cell for cell in cells}
+    verdicts = []
+    for label, comparison in found.items():
+        cell = of_label[label]
+        absent = Cell(cell.task, str(cell.baseline), "", None, [], 0, 0, 0)
+        base = of_label.get(str(cell.baseline), absent)
+        family = sum(other.baseline == cell.baseline for other in cells)
+        verdicts.append(_verdict(cell, base, comparison, _family(family, "arms"), tasks))
+    return verdicts
+
+
+def ablations_of(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
+    """Compares each arm that selects steps with those that differ in the choice of steps alone.
+
+    These are the head-only ablation and the matched random control. A verdict against the baseline
+    says what head, selection and fewer updates do together; these say what the selection rule does.
+    All of a task are one family of tests.
+    """
+    pairs = {
+        f"{cell.label} - {other.label}": (cell, other)
+        for cell in cells
+        for other in cells
+        if _settings(cell.arm).get("filter") == "sauna" and _is_control(other, cell)
+    }
+    found = compare(
+        {name: (cell.scores(), other.scores()) for name, (cell, other) in pairs.items()}
+    )
+    family = _family(len(pairs), "comparisons")
+    return [_verdict(*pairs[name], comparison, family, tasks) for name, comparison in found.items()]
+
+
+def _is_control(other: Cell, cell: Cell) -> bool:
+    """Whether `other` is the matched random control or the head-only ablation of `cell`.
+
+    Without stored settings an arm's name says what its rules are.
+    """
+    if other.rates_of == cell.label:
+        return True
+    if other.arm != "vex-head" or cell.baseline is None or other.baseline != cell.baseline:
+        return False
+    if cell.config and other.config:
+        names = (set(cell.config) | set(other.config)) - set(FILTERS_OWN)
+        return all(cell.config.get(name) == other.config.get(name) for name in names)
+    return all(
+        getattr(Config(), name) == value
+        for name, value in _settings(cell.arm).items()
+        if name not in FILTERS_OWN
+    )
+
+
+def _verdict(
+    cell: Cell, base: Cell, comparison: Comparison, family: str, tasks: int
+) -> dict[str, Any]:
+    """`family`: what the test is corrected for."""
+    failed = [c for c in (cell, base) if c.too_many_failed]
+    if failed and comparison.kind != "underpowered":
+        comparison = comparison._replace(kind="too many failed")
+    sentences = [
+        _finding(cell, base, comparison, family),
+        *_limits(cell, base, comparison, tasks),
+        *_circumstances(cell, base),
+    ]
+    text = " ".join(filter(None, sentences))
+    return {
+        "task": cell.task,
+        "label": cell.label,
+        "against": base.label,
+        "kind": comparison.kind,
+        "chance": comparison.improvement.value,
+        "text": text,
+    }
+
+
+def _family(number: int, what: str) -> str:
+    """`4 arms`; empty where a test is alone and nothing is corrected."""
+    return f"{number} {what}" if number > 1 else ""
+
+
+def _finding(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str:
+    """The verdict as a sentence, with what it rests on."""
+    kind, (chance, low, high) = comparison.kind, comparison.improvement
+    n, m = (len(c.scores()) for c in (cell, base))
+    if kind == "underpowered" or chance is None or low is None or high is None:
+        return _underpowered(cell, base, comparison, family)
+    if kind == "too many failed":
+        return _no_verdict(cell, base)
+    said = f"{kind} than" if kind != "no evidence" else "no evidence of a difference from"
+    correction = f" after Holm's correction for {family}" if family else ""
+    shown = [_shown(x, 2, 0.5) for x in (chance, low, high)]
+    p = "< 0.001" if comparison.p < 0.001 else f"= {_shown(comparison.p, 3, ALPHA)}"
+    return (
+        f"{cell.label}: {said} {base.label} on {cell.task} (probability of improvement {shown[0]} "
+        f"[{shown[1]}, {shown[2]}], exact p {p}{correction}, {n} against {m} seeds)."
+    )
+
+
+def _no_verdict(cell: Cell, base: Cell) -> str:
+    parts = ", ".join(
+        f"{c.failed} of {c.failed + len(c.complete)} of {c.label}"
+        for c in (cell, base)
+        if c.too_many_failed
+    )
+    return (
+        f"{cell.label}: no verdict against {base.label} on {cell.task}: too many seeds failed "
+        f"({parts}; at most {MAX_FAILED:.0%} may fail)."
+    )
+
+
+def _underpowered(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str:
+    n, m = (len(c.scores()) for c in (cell, base))
+    text = (
+        f"{cell.label}: too few seeds to say anything against {base.label} on {cell.task}: "
+        f"{n} against {m} ended; at least {comparison.least} of each are needed"
+    )
+    if family:
+        text += f" for {family}"
+    if comparison.needed is not None:
+        text += (
+            f", and {_about(comparison.needed)} for a difference as large as the one seen, "
+            f"were it the true one ({POWER:.0%} power)"
+        )
+    return text + "."
+
+
+def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[str]:
+    """What a reader could otherwise take the verdict for."""
+    kind, (chance, low, high) = comparison.kind, comparison.improvement
+    if kind in ("underpowered", "too many failed") or chance is None or low is None or high is None:
+        return []
+    n, m = (len(c.scores()) for c in (cell, base))
+    if kind == "no evidence":
+        said = []
+        if not low <= 0.5 <= high:
+            said.append("The interval leaves out 0.5, but the test, which decides, does not.")
+        elif comparison.p < ALPHA:
+            said.append("The test rejects, but the interval, which has to agree, holds 0.5.")
+        if comparison.needed is not None and comparison.needed > min(n, m):
+            said.append(
+                f"Were the difference seen the true one, {_about(comparison.needed)} seeds of "
+                f"each would be needed to find it ({POWER:.0%} power)."
+            )
+        return said
+    said = [f"This is not corrected for the {tasks} tasks."] if tasks > 1 else []
+    above = (cell.mean("final_return") or 0.0) - (base.mean("final_return") or 0.0)
+    if above * (chance - 0.5) < 0:
+        said.append(f"Its mean final return is {'higher' if above > 0 else 'lower'} all the same.")
+    return said
+
+
+def _circumstances(cell: Cell, base: Cell) -> list[str]:
+    """What else the difference, or the lack of one, may come from."""
+    filtering = _filtering(cell, "It") if _filters(cell) else _filtering(base, base.label)
+    said = [filtering, _experience(cell, base)]
+    for number, text in (
+        ("failed", "Failed seeds count as the worst outcome: {}."),
+        ("unfinished", "Not finished yet: {}; a verdict read early is wrong more often."),
+        ("unscored", "Complete seeds without a final return are left out: {}."),
+    ):
+        counts = [(_missing(c)[number], c.label) for c in (cell, base)]
+        parts = [f"{count} of {label}" for count, label in counts if count]
+        said.append(text.format(", ".join(parts)) if parts else "")
+    return said
+
+
+def _missing(cell: Cell) -> dict[str, int]:
+    return {
+        "failed": cell.failed,
+        "unfinished": cell.running + cell.waiting,
+        "unscored": len(cell.complete) - len(cell.values("final_return")),
+    }
+
+
+def _filters(cell: Cell) -> bool:
+    return _settings(cell.arm).get("filter") != "none"
+
+
+def _settings(arm: str) -> dict[str, Any]:
+    """The settings of an arm; none if this version does not know it."""
+    try:
+        return arm_settings(arm)
+    except BadInput:
+        return {}
+
+
+def _filtering(cell: Cell, name: str) -> str:
+    keep_rate = cell.mean("keep_rate")
+    if not _filters(cell) or keep_rate is None or keep_rate < UNFILTERED:
+        return ""
+    dropped = "none" if keep_rate >= 1 else f"{100 * (1 - keep_rate):.2g}%"
+    return f"{name} dropped {dropped} of its steps, so no difference can be credited to filtering."
+
+
+def _experience(cell: Cell, base: Cell) -> str:
+    own, other = cell.mean("env_steps"), base.mean("env_steps")
+    if not own or not other or abs(own / other - 1) <= MORE_STEPS:
+        return ""
+    return f"It took {own / other:.2f} times the env steps of {base.label}."
+
+
+def _shown(value: float, digits: int, edge: float) -> str:
+    """As many digits as it takes to see on which side of `edge` the value lies."""
+    while float(text := f"{value:.{digits}f}") == edge and value != edge:
+        digits += 1
+    return text
+
+
+def _about(seeds: int) -> str:
+    """Two significant digits, rounded up: the estimate carries no more."""
+    if seeds > MANY_SEEDS:
+        return f"more than {MANY_SEEDS}"
+    unit = 10 ** max(len(str(seeds)) - 2, 0)
+    return f"about {math.ceil(seeds / unit) * unit}"

@@ -1,0 +1,120 @@
+"""Spaces: what is taken and as what numbers, what is refused, and actions stretched to a box."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from gymnasium import spaces as gym
+
+from sauna.config.presets import resolve
+from sauna.config.settings import to_json
+from sauna.config.stored import stored_config
+from sauna.envs.device.contract import _reader, _writer
+from sauna.envs.spaces import action_writer, describe, observation_reader, read_spaces
+from sauna.system.errors import BadInput
+
+TWO = gym.Discrete(2)
+
+
+def box(*shape: int, dtype: Any = np.float32, high: float = 1.0) -> gym.Box:
+    return gym.Box(0, high, shape, dtype)
+
+
+BY_HAND = [
+    (gym.Tuple((gym.Discrete(3), gym.Discrete(2))), (2, 0), [0, 0, 1, 1, 0]),
+    (gym.Discrete(3, start=5), 6, [0, 1, 0]),
+    (gym.MultiDiscrete([2, 3], start=[1, 4]), np.array([2, 4]), [0, 1, 1, 0, 0]),
+    (gym.MultiDiscrete([[2, 2]]), np.array([[1, 0]]), [0, 1, 1, 0]),
+    (gym.MultiBinary((2, 2)), np.array([[1, 0], [1, 1]], np.int8), [1, 0, 1, 1]),
+    (
+        gym.Dict({"b": gym.Dict({"x": box(2), "y": gym.Discrete(2, start=-1)}), "a": box(1)}),
+        {"a": np.array([0.5]), "b": {"x": np.array([0.25, 0.75]), "y": -1}},
+        [0.5, 0.25, 0.75, 1, 0],
+    ),
+    (
+        gym.Dict({"board": box(2, 2, dtype=np.uint8, high=9), "turn": gym.MultiBinary(1)}),
+        {"board": np.array([[1, 2], [3, 9]], np.uint8), "turn": np.array([1], np.int8)},
+        [1, 2, 3, 9, 1],
+    ),
+]
+
+
+@pytest.mark.parametrize("space, value, expected", BY_HAND, ids=[str(b[0])[:40] for b in BY_HAND])
+def test_observations_are_the_numbers_by_hand_on_host_and_device(space, value, expected) -> None:
+    found = describe(space, TWO)
+    assert found.observation_shape == (len(expected),)
+    assert found.observation_kind in ("vector", "one_hot")
+    np.testing.assert_array_equal(observation_reader(space)(value), expected)
+    np.testing.assert_array_equal(jax.jit(_reader(space))(value), expected)
+
+
+REFUSED = [
+    (gym.Dict({"state": box(4), "camera": box(84, 84, 3, dtype=np.uint8)}), "['camera']"),
+    (gym.Dict({"far": gym.Tuple((box(1), box(3, 64, 64)))}), "['far'][1]"),
+    (gym.Dict({"goal": gym.Text(4)}), "['goal']: Text is not supported"),
+    (gym.Tuple((TWO, gym.Sequence(box(1)))), "[1]: Sequence is not supported"),
+    (box(84, 84, 3), "(84, 84, 3) and type float32 are not supported (only uint8 is)"),
+    (box(60, 80, dtype=np.float64), "give bytes up to 255 as uint8 [H, W, C]"),
+    (box(4, 84, 84, 1, dtype=np.uint8, high=255), "give a stack as uint8 [H, W, frames x C]"),
+]
+
+
+@pytest.mark.parametrize("space, words", REFUSED, ids=[r[1] for r in REFUSED])
+def test_what_would_become_a_long_vector_is_refused_with_what_to_do(space, words) -> None:
+    with pytest.raises(BadInput) as error:
+        describe(space, TWO)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_small_boards_and_masks_are_images_that_know_their_highest_byte() -> None:
+    for high, shape in ((3, (5, 5)), (1, (48, 48, 2)), (255, (40, 40, 3))):
+        found = describe(box(*shape, dtype=np.uint8, high=high), TWO)
+        assert (found.observation_kind, found.observation_high) == ("image", high)
+        assert found.observation_shape == (*shape, 1)[:3]
+    stored = list(found)[:-1]  # as runs before have it
+    assert read_spaces(stored) == found
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("low, high", [(0, 1000), (-0.01, 0.01), (0, 1), (-3, 3)])
+def test_a_bounded_box_is_reached_from_minus_one_to_one(low, high, dtype) -> None:
+    space = gym.Box(low, high, (1, 3), dtype)
+    write = action_writer(space, rescale=True)
+    action = np.array([-1.0, 0.5, 7.0], np.float32)
+    expected = [[low, low + 0.75 * (high - low), high]]
+    np.testing.assert_allclose(write(action), expected, rtol=1e-6, atol=1e-9)
+    assert space.contains(write(action))
+    on_device = np.asarray(jax.jit(_writer(space, True))(action))
+    np.testing.assert_allclose(on_device, expected, rtol=1e-5, atol=1e-7)
+
+
+def test_components_without_both_bounds_stay_as_they_are() -> None:
+    """Infinite bounds, and those of a float's range, which stand for none."""
+    most = np.finfo(np.float32).max
+    low = np.array([0, -np.inf, 0, -most, 2], np.float32)
+    high = np.array([10, np.inf, np.inf, most, 2], np.float32)
+    action = np.array([-1, -50, 30, 40, 5], np.float32)
+    got = action_writer(gym.Box(low, high), rescale=True)(action)
+    np.testing.assert_allclose(got, [0, -50, 30, 40, 2])
+
+
+def test_boxes_of_minus_one_to_one_have_the_same_bits() -> None:
+    space = gym.Box(-1, 1, (4,), np.float32)
+    actions = np.random.default_rng(0).normal(size=(500, 4)).astype(np.float32) * 2
+    one, other = action_writer(space, True), action_writer(space, False)
+    assert all(one(action).tobytes() == other(action).tobytes() for action in actions)
+
+
+def test_mujoco_and_stored_runs_keep_what_was_done_before() -> None:
+    for env in ("InvertedPendulum-v5", "Humanoid-v4", "mjx/Pusher-v5", "gymnasium:Hopper-v5"):
+        assert not resolve({"env": env}).rescale_actions
+        assert resolve({"env": env, "rescale_actions": True}).rescale_actions
+    for env in ("Pendulum-v1", "module:Humanoid", "gymnax/Pendulum-v1", "HumanoidMaze-v5"):
+        assert resolve({"env": env}).rescale_actions
+    stored = to_json(resolve({"env": "Pendulum-v1"}))
+    assert stored_config(stored).rescale_actions
+    del stored["rescale_actions"]
+    assert not stored_config(stored).rescale_actions

@@ -1,0 +1,168 @@
+"""Which environment and checkpoint an evaluation plays, for how long, and what it films."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+import sauna
+import worlds
+from helpers import SMALL
+from sauna import cli
+from sauna.experiments.evaluate import episodes, play
+from sauna.experiments.evaluate.artifact import load_artifact
+from sauna.experiments.evaluate.episodes import VideoFailure, kwargs_of
+from sauna.experiments.evaluate.policy import TrainedPolicy
+from sauna.experiments.evaluate.video import frame, frames_per_second, video
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, SaunaError
+
+SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 96}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """Of an environment with an argument, and three kept checkpoints."""
+    path = tmp_path_factory.mktemp("evaluated") / "run"
+    kept = {"checkpoint_every": 1, "keep_checkpoints": 3}
+    kwargs = {"first": 1000, "step": 2}  # no number is bad before episode 1000
+    sauna.train("worlds:NotANumber", quiet=True, out=path, env_kwargs=kwargs, **SETTINGS, **kept)
+    return path
+
+
+@pytest.fixture(scope="module")
+def endless(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("endless") / "run"
+    sauna.train("worlds:Never", quiet=True, out=path, **SETTINGS)
+    return path
+
+
+def test_the_runs_own_arguments_stay_and_can_be_changed(run: Path) -> None:
+    artifact = load_artifact(run)
+    own = {"first": 1000, "step": 2}
+    assert kwargs_of(artifact, None, None) == kwargs_of(artifact, "worlds:NotANumber", None) == own
+    assert kwargs_of(artifact, "worlds:NotANumber", {"step": 5}) == {"first": 1000, "step": 5}
+    assert kwargs_of(artifact, None, '{"step": 5}') == {"first": 1000, "step": 5}
+    assert kwargs_of(artifact, "worlds:Scripted", None) == {}
+    with pytest.raises(BadInput, match="env_kwargs: cannot read"):
+        kwargs_of(artifact, None, "[1]")
+
+
+def test_the_same_environment_by_name_plays_the_same_episodes(run: Path, capsys) -> None:
+    plain = sauna.evaluate(run, episodes=2)
+    named = sauna.evaluate(run, episodes=2, env="worlds:NotANumber")
+    assert named["members"] == plain["members"]
+    arguments = ["eval", str(run), "--episodes", "2", "--env-kwargs", '{"speed": 3}']
+    with pytest.raises(SystemExit) as exit:
+        cli.main(arguments)
+    assert exit.value.code == 2 and "cannot be made" in capsys.readouterr().err
+
+
+def test_any_kept_checkpoint_can_be_played_and_loaded(run: Path, capsys) -> None:
+    before = run_directory.read_config_file(run / "evaluation_sampled.json")
+    first = sauna.evaluate(run, episodes=2, checkpoint=1)
+    assert first["iteration"] == 1 and before["iteration"] == 3
+    assert first["members"] != before["members"]
+    assert run_directory.read_config_file(run / "evaluation_sampled.json") == before
+    for number in (1, 2):
+        expected = TrainedPolicy(load_artifact(run, iteration=number))
+        got = sauna.load(run, checkpoint=number)
+        np.testing.assert_array_equal(got(np.ones(3)), expected(np.ones(3)))
+    with pytest.raises(BadInput, match=r"keeps none of iteration 9 \(it has: 1, 2, 3\)"):
+        sauna.load(run, checkpoint=9)
+    cli.main(["eval", str(run), "--episodes", "1", "--checkpoint", "2"])
+    assert "checkpoint of iteration 2" in capsys.readouterr().out
+
+
+def test_an_episode_without_an_end_is_cut_and_that_is_said(endless: Path, capsys) -> None:
+    said: list[str] = []
+    result = sauna.evaluate(endless, episodes=2, max_steps=40, say=said.append)
+    assert result["members"]["ppo/0"]["lengths"] == [40, 40]
+    assert said == ["ppo/0: 2 of 2 episodes were cut after 40 steps"]
+    cli.main(["eval", str(endless), "--episodes", "1", "--max-steps", "7"])
+    assert "length 7.0" in capsys.readouterr().out
+    page = sauna.inspect(endless, episodes=2, max_steps=30, pictures=False)
+    assert page.stat().st_size > 10_000
+
+
+def test_a_long_evaluation_says_how_far_it_is(endless: Path, monkeypatch) -> None:
+    monkeypatch.setattr(play, "QUIET", 0.0)
+    said: list[str] = []
+    sauna.evaluate(endless, episodes=2, max_steps=3, say=said.append)
+    assert "ppo/0: episode 2 of 2, 3 env steps" in said
+
+
+def test_frames_of_odd_sides_and_without_a_rate_become_a_video(endless: Path) -> None:
+    """41 x 45 pixels; the frame of step t is as bright as t."""
+    result = sauna.evaluate(endless, episodes=1, max_steps=9, video=True, checkpoint=3)
+    frames = imageio.imread(result["video"])
+    assert frames.shape == (10, 42, 46, 3) and result["video"].endswith("ppo-0_sampled_3.mp4")
+    np.testing.assert_allclose(frames.mean((1, 2, 3)), np.arange(10) * 20, atol=8)
+    assert [path.name for path in (endless / "videos").iterdir()] == ["ppo-0_sampled_3.mp4"]
+
+
+def test_frames_go_to_the_encoder_one_by_one(tmp_path: Path) -> None:
+    """Its process has them before the video is complete."""
+    sizes = []
+    with video(tmp_path / "a.mp4", 30.0) as add:
+        for _ in range(120):
+            add(np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8))
+    sizes.append((tmp_path / "a.mp4").stat().st_size)
+    assert sizes[-1] > 1000
+
+
+def test_a_failing_video_keeps_the_returns(endless: Path, capsys) -> None:
+    arguments = {"env_kwargs": {"breaks": 4}, "max_steps": 9, "episodes": 3}
+    with pytest.raises(VideoFailure, match="the lamp is broken") as failure:
+        sauna.evaluate(endless, video=True, **arguments)
+    assert failure.value.result["members"]["ppo/0"]["lengths"] == [9, 9, 9]
+    flags = ["--episodes", "3", "--max-steps", "9", "--video", "--env-kwargs", '{"breaks": 4}']
+    with pytest.raises(SystemExit) as exit:
+        cli.main(["eval", str(endless), *flags])
+    told = capsys.readouterr()
+    assert exit.value.code == 1 and "the lamp is broken" in told.err
+    assert "ppo/0: return" in told.out and "3 episodes" in told.out
+    assert not list((endless / "videos").glob("*part*"))
+
+
+def test_render_mode_and_size_among_the_arguments_can_be_filmed(endless: Path) -> None:
+    arguments = {"env_kwargs": {"render_mode": None, "size": 33}, "max_steps": 3, "episodes": 1}
+    result = sauna.evaluate(endless, video=True, **arguments)
+    assert imageio.imread(result["video"]).shape == (4, 34, 38, 3)
+
+
+@pytest.mark.parametrize("rate", [None, 0, "fast", float("nan"), -3])
+def test_a_rate_that_is_none_is_thirty(rate) -> None:
+    env = worlds.Never()
+    env.metadata = {"render_fps": rate}
+    assert frames_per_second(env) == 30.0
+    env.metadata = None
+    assert frames_per_second(env) == 30.0
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    assert frame(np.zeros((3, 4), np.uint8)).shape == (4, 4, 3)
+    for drawn in (None, np.zeros((4, 4, 3)), np.zeros((4, 4, 2), np.uint8), [np.zeros((4, 4, 3))]):
+        with pytest.raises(SaunaError, match="video: the environment"):
+            frame(drawn)
+
+
+def test_stretched_actions_are_played_as_they_were_trained(tmp_path: Path) -> None:
+    """The mode of an untrained policy is about 0: the middle of [0, 1000]."""
+    lengths = {}
+    for stretched in (True, False):
+        out = tmp_path / str(stretched)
+        run = sauna.train("worlds:Wide", quiet=True, out=out, rescale_actions=stretched, **SETTINGS)
+        assert run_directory.read_config(run.path)["config"]["rescale_actions"] is stretched
+        lengths[stretched] = float(run.policy()(np.zeros(1))[0])
+    assert 300 < lengths[True] < 700 and lengths[False] < 5
+
+
+def test_a_run_of_parts_is_trained_and_played(tmp_path: Path) -> None:
+    run = sauna.train("worlds:Parts", quiet=True, out=tmp_path / "run", **SETTINGS)
+    assert run_directory.read_config(run.path)["spaces"][:2] == ["vector", [9]]
+    assert sauna.evaluate(run.path, episodes=1)["members"]["ppo/0"]["lengths"] == [4]
+    assert episodes.MAX_STEPS == 30_000
