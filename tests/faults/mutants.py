@@ -208,7 +208,8 @@ MUTANTS = [
         ("starts with a whole sample", "1e-4)", "1.0)"),
         (
             "inactive rows count",
-            'nothing changes.\n    """\n    weight = active[..., None]\n    number = weight.sum(-2)',
+            'nothing changes.\n    """\n    weight = active[..., None]\n'
+            "    number = weight.sum(-2)",
             'nothing changes.\n    """\n    weight = active[..., None]\n'
             "    number = weight.sum(-2) * 0 + weight.shape[-2]",
         ),
