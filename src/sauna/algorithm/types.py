@@ -1,7 +1,7 @@
 """The data that flows through one iteration, as declared types.
 
 Axes: `S` env steps tried in a rollout, `T` kept steps per env, `N` envs of one member, `B` samples
-of a minibatch. Everything here belongs to one member; only `population.py` knows of several.
+of a minibatch. Everything here belongs to one member; `rollout/program.py` alone knows of several.
 """
 
 from __future__ import annotations
