@@ -44,6 +44,8 @@ def metrics_row(
         "episode_lengths": [episode.length for episode in collected.episodes],
         "episode_truncated": [episode.truncated for episode in collected.episodes],
     }
+    if collected.episodes:
+        row["episode_length_mean"] = float(np.mean(row["episode_lengths"]))
     if counters.recent_returns:
         row["return_mean"] = float(np.mean(counters.recent_returns))
     if config.gae_over == "kept" and counters.reported_returns:
