@@ -1,4 +1,4 @@
-"""What the live table shows: what one looks for with PPO, and a rule's own columns if there is one."""
+"""What the live table shows: what one looks for with PPO, and what a rule or a head has."""
 
 from __future__ import annotations
 
