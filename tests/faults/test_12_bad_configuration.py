@@ -263,7 +263,7 @@ def wrong_on_device(rng: random.Random) -> Mistake:
         Mistake(["train", WORLD, "--backend=device"], "backend: worlds:Scripted is not"),
         Mistake(
             ["train", "CartPole-v1", "--backend=device"],
-            "backend: CartPole-v1 does not run on the device",
+            "CartPole-v1 does not run on the device",
         ),
         Mistake(["train", walk, "--devices=2"], "devices: 1 members of 1 environments cannot be"),
         Mistake(["train", f"jax_worlds:{typo('unlucky', rng)}"], "did you mean 'unlucky'?"),
