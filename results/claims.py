@@ -46,7 +46,7 @@ CLAIMS = (
     ),
     Claim(
         "The filter chooses better than a matched random control (not in the paper)",
-        (("sauna 0.8", "random-drop"),),
+        (("sauna 0.8", RANDOM_CONTROL),),
     ),
 )
 HEADER = [

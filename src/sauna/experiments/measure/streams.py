@@ -27,7 +27,6 @@ from sauna.config.settings import Config
 from sauna.config.stored import read_stored
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
-from sauna.system import run_directory
 from sauna.system.checkpoint import load_checkpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, fitting, flat_params, moments_of, under
@@ -81,24 +80,22 @@ def load_snapshot(run: Path, name: str, iteration: int) -> MemberSnapshot:
     Raises:
       BadCheckpoint: the checkpoint cannot be trusted or read.
     """
-    stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     settings = read_stored(loaded.manifest)
     spaces = read_spaces(loaded.manifest["spaces"])
-    config, everyone = settings.config, settings.members
-    place = next(p for p, member in enumerate(everyone) if member.name == name)
+    config = settings.config
+    member = next(one for one in settings.members if one.name == name)
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)
     example = program.policy.init(jax.random.key(0))
     params = flat_params(program.policy, example, under("params/", arrays))
     counters = Counters.from_arrays(arrays)
-    rates = stored["drop_rates"][place] if stored["drop_rates"] else []
-    hypers = hypers_now(everyone[place].config, rates, counters, iteration)
+    hypers = hypers_now(member.config, counters)
     return MemberSnapshot(
         run,
         config,
         spaces,
-        everyone[place],
+        member,
         iteration,
         program,
         params,

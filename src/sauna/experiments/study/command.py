@@ -137,7 +137,7 @@ def _check_runs(spec: Spec) -> None:
             if key not in found:
                 found[key] = look_at(config)
             try:
-                prepared = examine(placed, arm.checked_overrides(task), found[key])
+                prepared = examine(placed, arm.overrides(task, arm.seeds), found[key])
                 if spec.measurement:
                     spec.measurement.check_spaces(prepared.config, prepared.spaces)
             except BadInput as error:
@@ -228,7 +228,10 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
     if path.is_file():
         stored = json.loads(path.read_text())
         if not _is_same(stored["study"], spec):
-            raise BadInput(f"study: {place} holds another study of this name; give --out")
+            raise BadInput(
+                f"study: {place} holds another study of this name; "
+                "remove it (the runs in units/ stay) or give --out"
+            )
         return int(stored["seeds_per_unit"])
     return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
 

@@ -99,6 +99,7 @@ def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
         waiting,
         stored.get("rates_of"),
         stored.get("config") or {},
+        stored.get("command") or "",
     )
 
 
