@@ -536,7 +536,7 @@ def _test(copy: Path, tests: tuple[str, ...], log: Path) -> None:
 
 
 def _test_file(name: str) -> Path:
-    """`faults/test_07_poisoned_batch`, or a module's name anywhere below `tests/`."""
+    """`faults/test_07_poisoned_batch`, or a module's name any_member below `tests/`."""
     if "/" in name:
         return ROOT / "tests" / f"{name}.py"
     return next((ROOT / "tests").rglob(f"test_{name}.py"))

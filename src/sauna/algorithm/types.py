@@ -199,7 +199,7 @@ class Sampler(NamedTuple):
       init: `() -> state`; the state is carried over iterations and checkpointed.
       choose: `(state, samples, key) -> (state, choice)`.
       share: static, the most that a choice takes: arrays have `K = ceil(share * M)` rows.
-      reads_policy: whether `samples` tell of today's policy, which takes one forward pass.
+      reads_policy: whether `samples` hold those of today's policy, which takes one forward pass.
       each_epoch: choose before each epoch instead of once per iteration.
     """
 

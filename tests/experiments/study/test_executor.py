@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,21 +73,6 @@ def test_a_unit_is_continued_once_and_then_each_of_its_seeds_trained_once(tmp_pa
 def test_one_that_crashed_once_is_continued_and_not_split(tmp_path: Path) -> None:
     executor, (ppo, _) = run(tmp_path, {**TWO, "seeds": [0, 2]}, crashes=(0,))
     assert executor.starts[ppo.name] == 2 and not list(tmp_path.rglob("split.json"))
-
-
-def test_a_coin_tries_again_with_its_source(tmp_path: Path, monkeypatch) -> None:
-    """The seed's folder is removed, as the documentation says, and only that of the source."""
-    arms = [{"label": "sauna"}, {"label": "random-drop"}]
-    _, (sauna, coin) = run(tmp_path, {**TWO, "arms": arms})
-    places = [tmp_path / unit.name / "seed-1" for unit in (sauna, coin)]
-    assert all((place / "failed.json").exists() for place in places)
-    executor, _ = run(tmp_path, {**TWO, "arms": arms})
-    assert not executor.starts  # nothing was removed
-    shutil.rmtree(places[0])
-    monkeypatch.setattr(Broken, "unlucky", None)
-    run(tmp_path, {**TWO, "arms": arms})
-    assert all(run_directory.is_complete(place / "run") for place in places)
-    assert not list(tmp_path.rglob("failed.json"))
 
 
 def test_two_labels_of_the_same_settings_are_one_unit(tmp_path: Path) -> None:

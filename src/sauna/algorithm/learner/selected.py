@@ -176,7 +176,7 @@ def _epoch(
     )
     batch = _standardized(batch, choice, config)
 
-    def goes_on(now: tuple[Array, TrainState, Totals]) -> Array:
+    def continues(now: tuple[Array, TrainState, Totals]) -> Array:
         return (now[0] < steps) & ~now[2].stopped
 
     def step(now: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
@@ -186,7 +186,7 @@ def _epoch(
         after, losses, norm = gradient_step(state, part, hypers, parts=parts)
         return i + 1, *_counted(totals, state, after, losses, norm, part)
 
-    _, state, totals = jax.lax.while_loop(goes_on, step, (jnp.int32(0), state, totals))
+    _, state, totals = jax.lax.while_loop(continues, step, (jnp.int32(0), state, totals))
     return state, totals
 
 

@@ -25,9 +25,11 @@ from sauna.algorithm.types import Array, Hypers, Rollout, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.config.stored import read_stored
+from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
-from sauna.system.checkpoint import load_checkpoint
+from sauna.system import run_directory
+from sauna.system.checkpoint import BadCheckpoint, load_checkpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, fitting, flat_params, moments_of, under
 
@@ -80,11 +82,15 @@ def load_snapshot(run: Path, name: str, iteration: int) -> MemberSnapshot:
     Raises:
       BadCheckpoint: the checkpoint cannot be trusted or read.
     """
+    stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
+    check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust=False)
     settings = read_stored(loaded.manifest)
     spaces = read_spaces(loaded.manifest["spaces"])
     config = settings.config
-    member = next(one for one in settings.members if one.name == name)
+    member = next((one for one in settings.members if one.name == name), None)
+    if member is None:
+        raise BadCheckpoint(f"{loaded.path}: its config has no member {name!r}")
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)
     example = program.policy.init(jax.random.key(0))

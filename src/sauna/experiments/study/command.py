@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import signal
@@ -13,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import COMPARED_SEEDS, algorithm_of, chosen_preset
+from sauna.config.trust import check_trusted, covers, seal
 from sauna.envs.probe import Probe
 from sauna.experiments.report.numbers import digits_of_tasks, interval, number
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
+from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
@@ -34,6 +35,7 @@ from sauna.experiments.study.units import (
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
+from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import examine, look_at, place
 
 
@@ -81,6 +83,7 @@ def study(
     on: str = "local",
     address: str = "",
     quiet: bool = False,
+    accept_changed_code: bool = False,
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
@@ -94,6 +97,7 @@ def study(
       on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
       address: of the cluster.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
 
     Returns:
       the summary.
@@ -111,13 +115,17 @@ def study(
         ray_cluster.check(address)
     elif address:
         raise BadInput("address: read with --on ray only")
-    _check_runs(spec)
+    out = Path.cwd() / out  # an environment may go elsewhere
+    with kept_folder():
+        _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
-        return _train(LocalExecutor, spec, out, command, jobs, command, quiet)
+        return _train(LocalExecutor, spec, out, command, jobs, command, quiet, accept_changed_code)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with ray_cluster.connected(address, jobs) as jobs:
-        return _train(ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet)
+        return _train(
+            ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet, accept_changed_code
+        )
 
 
 def _check_runs(spec: Spec) -> None:
@@ -158,6 +166,7 @@ def _train(
     jobs: int,
     again: str,
     quiet: bool,
+    accept_changed_code: bool,
 ) -> dict[str, Any]:
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
@@ -165,7 +174,9 @@ def _train(
     with _locked(folder):
         _note(spec, place, size)
         units = units_of(spec, size)
+        check_same_code(units, folder, accept_changed_code)
         view = StudyView(spec, units, folder, quiet)
+        reopen_damaged(units, folder, view.say)
         members = sum(len(unit.seeds) for unit in units)
         view.say(
             f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
@@ -226,13 +237,16 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
     if place.exists() and not place.is_dir():
         raise BadInput(f"out: {place} is no folder")
     if path.is_file():
-        stored = json.loads(path.read_text())
-        if not _is_same(stored["study"], spec):
+        stored = run_directory.read_config_file(path)
+        text, size = stored.get("study"), stored.get("seeds_per_unit")
+        if not isinstance(text, dict) or not isinstance(size, int) or size < 1:
+            raise BadInput(f"out: {path} is not what a study writes")
+        if not covers(spec.text, text) or not _is_same(text, spec):
             raise BadInput(
-                f"study: {place} holds another study of this name; "
-                "remove it (the runs in units/ stay) or give --out"
+                f"study: {place} holds another study of this name; remove it (the runs in units/ "
+                f"stay) or give --out"
             )
-        return int(stored["seeds_per_unit"])
+        return size
     return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
 
 
@@ -242,7 +256,20 @@ def _note(spec: Spec, place: Path, size: int) -> None:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
-    run_directory.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+    run_directory.write_json(
+        place / "study.json", {"study": spec.text, "seeds_per_unit": size, "seal": seal(spec.text)}
+    )
+
+
+def check_study(text: Mapping[str, Any], out: Path, trust: bool) -> None:
+    """Refuses code that a study's file names, unless this user has run it before.
+
+    Raises:
+      BadInput: with everything that is named.
+    """
+    path = out / str(text["name"]) / "study.json"
+    stored = run_directory.read_config_file(path) if path.is_file() else {}
+    check_trusted(text, f"study {text['name']!r}", stored.get("seal"), trust)
 
 
 def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:

@@ -22,6 +22,7 @@ from sauna.experiments.report.readout import read_out
 from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
 from sauna.experiments.study.summary import ABLATION
+from sauna.system.safe_write import replace_file
 
 # A shape beside the colour of each kind of verdict.
 MARKS = {
@@ -58,7 +59,7 @@ def write_report(
     write_figures(results, summary, folder, section)
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(make_page(results, summary, section), encoding="utf-8")
+    replace_file(path, make_page(results, summary, section).encode())
     return path
 
 

@@ -29,11 +29,12 @@ from sauna.experiments.study.verdicts import (
     MORE_STEPS,
     UNFILTERED,
     ablations_of,
+    is_random_control,
     verdicts_of,
 )
 from sauna.system.errors import BadInput
 
-__all__ = ["ABLATION", "MORE_STEPS", "UNFILTERED", "summarize"]
+__all__ = ["ABLATION", "MORE_STEPS", "UNFILTERED", "random_controls", "summarize"]
 
 FORMAT = 1
 GRID = 60  # points of a curve at most
@@ -74,6 +75,20 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
         "profiles": {task: _profiles(of_task[task]) for task in of_task},
         "curves": {task: {cell.label: _curves(cell) for cell in of_task[task]} for task in of_task},
     }
+
+
+def random_controls(results: Mapping[str, Any], label: str) -> list[str]:
+    """Lists the labels of the matched random controls of `label`, those of 0.1.0 last."""
+    cells = [_cell(stored, results["baseline"]) for stored in results["cells"]]
+    found = [
+        other
+        for cell in cells
+        if cell.label == label
+        for other in cells
+        if other.task == cell.task and is_random_control(other, cell)
+    ]
+    found.sort(key=lambda other: other.rates_of is not None)
+    return list(dict.fromkeys(other.label for other in found))
 
 
 def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
