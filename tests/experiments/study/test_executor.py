@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -73,6 +74,20 @@ def test_a_unit_is_continued_once_and_then_each_of_its_seeds_trained_once(tmp_pa
 def test_one_that_crashed_once_is_continued_and_not_split(tmp_path: Path) -> None:
     executor, (ppo, _) = run(tmp_path, {**TWO, "seeds": [0, 2]}, crashes=(0,))
     assert executor.starts[ppo.name] == 2 and not list(tmp_path.rglob("split.json"))
+
+
+def test_a_failed_seed_tries_again_once_its_folder_is_removed(tmp_path: Path, monkeypatch) -> None:
+    """As the documentation says; the other arm's stays failed."""
+    _, units = run(tmp_path, TWO)
+    places = [tmp_path / unit.name / "seed-1" for unit in units]
+    assert all((place / "failed.json").exists() for place in places)
+    executor, _ = run(tmp_path, TWO)
+    assert not executor.starts  # nothing was removed
+    shutil.rmtree(places[0])
+    monkeypatch.setattr(Broken, "unlucky", None)
+    run(tmp_path, TWO)
+    assert run_directory.is_complete(places[0] / "run")
+    assert list(tmp_path.rglob("failed.json")) == [places[1] / "failed.json"]
 
 
 def test_two_labels_of_the_same_settings_are_one_unit(tmp_path: Path) -> None:
