@@ -114,6 +114,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     inspect.add_argument("--out", metavar="PAGE", help=text)
     text = f"env steps after which an episode is cut (default {MAX_STEPS})"
     for command in (evaluate, inspect):
+        command.add_argument("run", metavar="RUN", help="run directory")
         command.add_argument("--max-steps", metavar="N", default=str(MAX_STEPS), help=text)
         most_likely = "the most likely action (default: sampled, as in training)"
         command.add_argument("--deterministic", action="store_true", help=most_likely)

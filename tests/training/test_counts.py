@@ -93,7 +93,7 @@ def test_compiled_calls_per_rollout() -> None:
 
 
 def test_a_network_of_another_kind_acts_by_one_call_per_step() -> None:
-    trainer = Trainer("worlds:Scripted", arm="ppo", network="test_networks:Sine")
+    trainer = Trainer("worlds:Scripted", arm="ppo", network="trunks:Sine")
     trainer.iterate(0)
     trainer.calls.clear()
     assert trainer.iterate(1) == STEPS
