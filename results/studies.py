@@ -76,11 +76,9 @@ def shown_label(label: str) -> str:
 def former_controls(cells: Iterable[Mapping[str, Any]]) -> str:
     """Says of which kind the random controls of 0.1.0 among these are; empty if there is none."""
     arms = {cell["label"]: cell["rates_of"] for cell in cells if cell.get("rates_of")}
-    return " ".join(
-        f"`{shown_label(label)}` is a random control that repeated the drop rates of another run: "
-        f"that of `{shown_label(arm)}` with the same seed."
-        for label, arm in arms.items()
-    )
+    those = [f"`{shown_label(label)}` those of `{shown_label(arms[label])}`" for label in arms]
+    said = "A random control here repeated the drop rates of another run"
+    return f"{said}: {', '.join(those)}, seed by seed." if arms else ""
 
 
 def listed(sentences: Iterable[str]) -> str:
