@@ -18,6 +18,10 @@ from sauna import (
     StopRule,
 )
 
+nothing = StepFilter(
+    lambda num_envs, capacity: (), lambda state, step, key, hypers: (state, step.vex > jnp.inf)
+)
+
 
 def likely(least: float = -3.0) -> StepFilter:
     """Keeps the steps whose action was not too unlikely."""

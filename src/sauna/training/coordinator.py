@@ -28,6 +28,7 @@ from sauna.system.signals import handled
 from sauna.system.tracebacks import cause_of
 from sauna.system.watchdog import Watchdog
 from sauna.training.display import Display
+from sauna.training.empty_updates import EmptyUpdates
 from sauna.training.run import Run, resume_command
 from sauna.training.tensorboard import TensorBoard
 from sauna.training.worker import serve, write_job
@@ -60,6 +61,7 @@ class Coordinator:
         self._signal: int | None = None
         self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
+        self._empty_updates = EmptyUpdates()
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
@@ -272,6 +274,8 @@ class Coordinator:
                 for t in timings
                 for member, seconds in t["update_cpu_seconds"].items()
             }
+        for warning in self._empty_updates.see(rows):
+            self._display.say(warning)
         self._logs.append("metrics.jsonl", rows)
         self._logs.append("timing.jsonl", [timing])
         self._tensorboard.write(rows, timing)

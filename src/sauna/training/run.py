@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.config.checks import check_consistent, local_parts
+from sauna.config.checks import cautions, check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
@@ -138,6 +138,8 @@ def _show_notes(prepared: Prepared, display: Display) -> None:
     config = prepared.config
     if note := many_seeds(config.seeds):
         display.say(note)
+    for caution in cautions(config):
+        display.say(caution)
     if prepared.differs:
         display.say(
             f"warning: {config.env} does not repeat itself ({prepared.differs}): this run can be "
