@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_FAILED = 0.25  # share of an arm's ended seeds that may fail before there is no verdict
+from sauna.experiments.statistics import MAX_FAILED
+
+__all__ = ["MAX_FAILED", "Cell"]
 
 
 class Cell(NamedTuple):
