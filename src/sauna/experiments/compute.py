@@ -91,7 +91,7 @@ def joined(curves: Sequence[tuple[Any, Any]]) -> Curves | None:
     if not known or min(points.shape[1] for points in known) == 0:
         return None
     grid = np.unique(np.concatenate([points[0] for points in known]))
-    rows = [np.interp(grid, *points, left=np.nan) for points in known]
+    rows = [np.interp(grid, points[0], points[1], left=np.nan) for points in known]
     return Curves(grid, np.stack(rows))
 
 

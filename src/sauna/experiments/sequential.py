@@ -78,6 +78,8 @@ def capped(most: int, design: Sequence[Look] = DESIGN) -> tuple[Look, ...]:
     """
     if most > design[-1].seeds:
         raise ValueError(f"a tournament takes at most {design[-1].seeds} seeds, not {most}")
+    if most == design[-1].seeds:
+        return tuple(design)
     before = [look for look in design if look.seeds < most]
     left = sum(look.level for look in design) - sum(look.level for look in before)
     return (*before, Look(most, left, 0.0))

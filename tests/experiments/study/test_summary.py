@@ -34,6 +34,8 @@ ROW = {
     "keep_rate",
     "env_steps",
     "kept_steps",
+    "samples_backward",
+    "learner_cpu_seconds",
     "improvement",
 }
 

@@ -12,6 +12,7 @@ from sauna.experiments.report.figures import (
     Panel,
     Plot,
     Section,
+    compute_plots,
     looks_of,
     panel_svg,
     plots_of,
@@ -21,6 +22,8 @@ from sauna.experiments.report.page import render
 from sauna.experiments.report.readout import read_out
 from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
+from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
+from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.summary import ABLATION
 
 # A shape beside the colour of each kind of verdict.
@@ -30,6 +33,7 @@ MARKS = {
     "no evidence": "\N{WHITE CIRCLE}",
     "underpowered": "\N{HORIZONTAL ELLIPSIS}",
     "too many failed": "\N{MULTIPLICATION SIGN}",
+    "open": "\N{HORIZONTAL ELLIPSIS}",
 }
 ANSWERS = {
     "better": "better",
@@ -37,6 +41,7 @@ ANSWERS = {
     "no evidence": "no evidence of a difference",
     "underpowered": "too few seeds to decide",
     "too many failed": "too many seeds failed to decide",
+    "open": "still open",
 }
 UNFOLDED = 5  # verdicts that are shown with all their words
 
@@ -79,6 +84,10 @@ def make_page(
         section=section,
         summary=summary,
         ablation=ABLATION,
+        ranking=tables.ranking(summary),
+        ranking_about=RANKING,
+        equal_compute_about=EQUAL_COMPUTE,
+        by_compute=[(plot, _panels(plot, looks)) for plot in compute_plots(summary)],
         marks=MARKS,
         unfolded=UNFOLDED,
         totals=totals,
@@ -88,7 +97,7 @@ def make_page(
         metric=results["metric"],
         baseline=results["baseline"],
         looks={label: look for label, look in looks.items() if label in drawn},
-        figures=[(plot, [_panel(plot, panel, looks) for panel in plot.panels]) for plot in plots],
+        figures=[(plot, _panels(plot, looks)) for plot in plots],
         paper=tables.paper(results, summary),
         failures=tables.failures(results["cells"]),
         settings=tables.settings(results),
@@ -182,6 +191,10 @@ def pairs(found: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, dict[str, 
         )
         for label, against in dict.fromkeys((v["label"], v["against"]) for v in found)
     ]
+
+
+def _panels(plot: Plot, looks: Mapping[str, Look]) -> list[dict[str, Any]]:
+    return [_panel(plot, panel, looks) for panel in plot.panels]
 
 
 def _panel(plot: Plot, panel: Panel, looks: Mapping[str, Look]) -> dict[str, Any]:
