@@ -34,7 +34,7 @@ def control_of(arm: str, given: Mapping[str, Any] = MappingProxyType({})) -> str
 def rule_of(arm: str) -> str | None:
     """Names the arm that a control follows, `gigaflow` of `gigaflow+random`; None for others."""
     rule, _, control = arm.rpartition("+")
-    return rule if control in CONTROLS else None
+    return rule if rule and control in CONTROLS else None
 
 
 def with_controls(arms: Sequence[str], given: Mapping[str, Any]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ ABOUT = (
     "percentile bootstrap over seeds, too narrow with few of them; no verdict rests on it. CPU "
     "seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
-WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "learner's CPU seconds"}
+WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "CPU seconds of the learner"}
 
 
 def curves_over(cell: Cell, axis: str) -> Curves | None:
@@ -73,12 +73,16 @@ def _text(cell: Cell, base: Cell, ratios: dict[str, Ratio]) -> str:
     goal = f"{base.label}'s final return on {cell.task}"
     if all(ratio.value is None for ratio in ratios.values()):
         return f"{cell.label}: does not reach {goal}."
-    said = [_share(ratio, WORDS[axis]) for axis, ratio in ratios.items() if ratio.value is not None]
+    said = [
+        _share(ratio, f"{whose} {WORDS[axis]}")
+        for (axis, ratio), whose in zip(ratios.items(), (f"{base.label}'s", "its"), strict=False)
+        if ratio.value is not None
+    ]
     return f"{cell.label}: reaches {goal} with {' and '.join(said)}."
 
 
 def _share(ratio: Ratio, words: str) -> str:
-    text = f"{ratio.value:.2f} of its {words}"
+    text = f"{ratio.value:.2f} of {words}"
     if ratio.low is None:
         return text
     high = "not reached" if ratio.high is None else f"{ratio.high:.2f}"

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sauna.config.controls import rule_of
 from sauna.experiments.report.figures import (
     NOTHING,
     Panel,
@@ -114,7 +115,9 @@ def question(results: Mapping[str, Any], section: Section = NOTHING) -> str:
         return section.title
     baseline = results["baseline"]
     tasks = list(dict.fromkeys(cell["task"] for cell in results["cells"]))
-    arms = list(dict.fromkeys(cell["label"] for cell in results["cells"]))
+    named = {cell["arm"] for cell in results["cells"]}
+    rules = [cell for cell in results["cells"] if rule_of(cell["arm"]) not in named]
+    arms = list(dict.fromkeys(cell["label"] for cell in rules))
     others = [label for label in arms if label != baseline]
     where = tasks[0] if len(tasks) == 1 else f"{len(tasks)} tasks"
     if not others:

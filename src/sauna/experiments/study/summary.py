@@ -82,10 +82,17 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
         rows = ranking.rank(results)
         summary |= {
             "ranking": rows,
+            "table": _as_ranked(summary["table"], rows),
             "verdicts": ranking.verdicts(rows),
             "filtering": ranking.control_verdicts(rows),
         }
     return summary
+
+
+def _as_ranked(table: Any, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Replaces each probability of improvement by that of the look where the arm stopped."""
+    ranked = {(row["task"], row["label"]): row["improvement"] for row in rows}
+    return [{**row, "improvement": ranked.get((row["task"], row["label"]))} for row in table]
 
 
 def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
