@@ -1,11 +1,11 @@
 # make setup  install into .venv what development needs
-# make demo   install into .venv, train SAUNA on InvertedPendulum-v5, show the result
+# make demo   install into .venv, train PPO and SAUNA side by side, say where the picture is
 # make test   install into .venv, run the tests
 # make test-faults  a few tries of every fault of docs/concepts/reliability.md
 # make test-newest  both with the newest versions of all packages, in .venv-newest
 # make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
 # make campaign  every fault of docs/concepts/reliability.md in full (hours; continues where it stopped)
-# make mutants   plants mistakes in core/ and selection/ and counts those that the tests catch
+# make mutants   plants mistakes in algorithm/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
 # make cost   what checks and checkpoints take of a training
 # make docs   build the documentation site into site/; a broken link is an error
@@ -53,8 +53,10 @@ setup: $(VENV)/.dev
 setup-ci: $(VENV)/.ci
 
 demo: $(VENV)/.run
-	$(BIN)/sauna train InvertedPendulum-v5 --arm sauna --seeds 3 --steps 100000
+	$(BIN)/sauna train InvertedPendulum-v5 --arm ppo,sauna --threshold 0.8 --seeds 3 --steps 100000
+	@echo "Look at the picture named above: PPO beside SAUNA, 3 seeds each."
 	$(USE)
+	@echo "Then try: sauna train CartPole-v1 --steps 100000, or: sauna compare InvertedPendulum-v5"
 
 # Half of the time of a first run is compiling: here without LLVM's optimisations.
 PYTEST = JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --durations 15

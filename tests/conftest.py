@@ -5,11 +5,15 @@ In CI a test that needs an accelerator (marker `gpu`) may be skipped, and one wh
 """
 
 import os
+import tempfile
 from collections.abc import Generator
 
 import pytest
 
 from sauna.system.jax_setup import configure_jax
+
+# Not this user's own key: that of one test session and of the processes that it starts.
+os.environ.setdefault("SAUNA_KEY_FILE", os.path.join(tempfile.mkdtemp(), "key"))
 
 configure_jax()
 

@@ -96,7 +96,7 @@ def policy_output(job: Job, arrays: dict[str, np.ndarray], member: str, observat
 
 def configured(**settings: Any) -> Config:
     """A config without looking at an environment."""
-    return dataclasses.replace(resolve({"env": "none", **settings}), network="mlp")
+    return dataclasses.replace(resolve({"env": "none", "arm": "sauna", **settings}), network="mlp")
 
 
 def equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:

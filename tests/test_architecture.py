@@ -28,6 +28,7 @@ FLOORS = (
     "algorithm.learner",
     "training.loop.job",
     "training.loop",
+    "training.check_selection",
     "training.check_plugins",
     "training.prepare",
     "training.worker",

@@ -166,7 +166,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
     done = sauna("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
     assert done.returncode == 2 and "did you mean 'sauna/" in done.stderr
     done = sauna("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
-    assert done.returncode == 2 and "the run's observation space is" in done.stderr
+    assert done.returncode == 2 and "other spaces than the run: observation shape" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from typing import Any
 import sauna
 from sauna import cli
 from sauna.config import presets
+from sauna.config.fields import GROUPS
 from sauna.config.settings import FIELDS, TYPES, flag
 
 MARK = re.compile(r"<!-- generated: (\w+) -->")
@@ -95,12 +96,13 @@ def _flags(names: list[str]) -> str:
 
 
 def settings() -> str:
-    """A table of every field of the configuration."""
-    rows = [
-        [f'<span id="{name}"></span>`{flag(name)}`', _default(name), _meaning(name)]
-        for name in FIELDS
-    ]
-    return _table(["Setting", "Default", "Meaning"], rows)
+    """A table of the fields of the configuration for each group of them."""
+    parts = []
+    for group in GROUPS:
+        names = [name for name, field in FIELDS.items() if field.metadata["group"] == group]
+        rows = [[f'<span id="{n}"></span>`{flag(n)}`', _default(n), _meaning(n)] for n in names]
+        parts += [f"## {_sentence(group)}", _table(["Setting", "Default", "Meaning"], rows)]
+    return "\n\n".join(parts)
 
 
 def _default(name: str) -> str:

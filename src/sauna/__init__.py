@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sauna.algorithm.learner.vex_targets import VexTarget
-    from sauna.algorithm.types import StepFilter
+    from sauna.algorithm.types import (
+        Choice,
+        Hypers,
+        LossTerms,
+        LossWeight,
+        Sampler,
+        SamplerSetup,
+        Samples,
+        ScoredStep,
+        StepFilter,
+        StopRule,
+    )
     from sauna.api import Result, compare, load, resume, train
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
@@ -18,10 +29,19 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BadInput",
+    "Choice",
+    "Hypers",
     "JaxEnv",
+    "LossTerms",
+    "LossWeight",
     "Result",
+    "Sampler",
+    "SamplerSetup",
+    "Samples",
     "SaunaError",
+    "ScoredStep",
     "StepFilter",
+    "StopRule",
     "Transition",
     "VexTarget",
     "compare",
@@ -44,7 +64,21 @@ _HOMES = {
     "Transition": "sauna.envs.device.contract",
     "evaluate": "sauna.experiments.evaluate.episodes",
     "inspect": "sauna.experiments.inspect.command",
-    "StepFilter": "sauna.algorithm.types",
+    **dict.fromkeys(
+        (
+            "Choice",
+            "Hypers",
+            "LossTerms",
+            "LossWeight",
+            "Sampler",
+            "SamplerSetup",
+            "Samples",
+            "ScoredStep",
+            "StepFilter",
+            "StopRule",
+        ),
+        "sauna.algorithm.types",
+    ),
     "VexTarget": "sauna.algorithm.learner.vex_targets",
 }
 

@@ -57,7 +57,7 @@ class Result:
 
     def policy(self, member: int | str = 0) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`."""
-        return load(self.path, member)
+        return load(self.path, member, trust=True)
 
     def __repr__(self) -> str:
         return f"Result({str(self.path)!r})"
@@ -114,6 +114,7 @@ def compare(
     out: str | Path = "runs",
     processes: int = 0,
     quiet: bool = False,
+    accept_changed_code: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
     """Does filtering help on `env`? Trains the arms and says what the data support.
@@ -128,6 +129,7 @@ def compare(
       out: the folder of runs and results.
       processes: trainings at a time; 0: one per core.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
       **settings: of every run (`seeds=6`, `steps=1_000_000`).
 
     Returns:
@@ -149,11 +151,18 @@ def compare(
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(task, chosen, parsed, is_tournament)
     command = compare_command(task, arms, overrides, out, rules, controls)
-    return study(spec, Path(out), command, processes, quiet=quiet)
+    accept = accept_changed_code
+    return study(spec, Path(out), command, processes, quiet=quiet, accept_changed_code=accept)
 
 
 def resume(
-    path: str | Path, *, quiet: bool = False, inexact: bool = False, **changes: Any
+    path: str | Path,
+    *,
+    quiet: bool = False,
+    inexact: bool = False,
+    trust: bool = False,
+    accept_changed_code: bool = False,
+    **changes: Any,
 ) -> Result:
     """Continues an interrupted run to its end; the result is that of a run left alone.
 
@@ -161,18 +170,25 @@ def resume(
       path: the run directory.
       quiet: show nothing.
       inexact: start new episodes where environments cannot be brought back.
+      trust: the code that the run names may run, even if another user named it.
+      accept_changed_code: go on even if the code that the run names is not what it was.
       **changes: settings that do not touch what is computed (`processes`, ...), and the parts
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
     rest = provide(Path(path), changes, PARTS)
-    run = runs.reopen(Path(path), rest, display)
+    run = runs.reopen(Path(path), rest, display, trust, accept_changed_code)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
 
 
 def load(
-    path: str | Path, member: int | str = 0, *, checkpoint: int | None = None, **parts: Any
+    path: str | Path,
+    member: int | str = 0,
+    *,
+    checkpoint: int | None = None,
+    trust: bool = False,
+    **parts: Any,
 ) -> Any:
     """The policy of a run, as `policy(observation) -> action`.
 
@@ -182,13 +198,15 @@ def load(
       path: the run directory.
       member: name (`sauna/0`) or index.
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
+      trust: the code that the run names may run, even if another user named it.
       **parts: those that were passed by value when the run started (`env`, `network`, ...).
     """
-    provide(Path(path), parts, PARTS)
     from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
-    return TrainedPolicy(load_artifact(Path(path), iteration=checkpoint), member)
+    artifact = load_artifact(Path(path), iteration=checkpoint, trust=trust)
+    provide(Path(path), parts, PARTS)
+    return TrainedPolicy(artifact, member)
 
 
 def _named(name: str, value: Any) -> Any:

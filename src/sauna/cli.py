@@ -34,8 +34,9 @@ from sauna.config.presets import (
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
+from sauna.system.tracebacks import user_frames
 
 LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
 # Where a comparison or a study trains.
@@ -58,6 +59,10 @@ _PLACE: dict[str, dict[str, Any]] = {
     "address": {
         "default": "",
         "help": "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)",
+    },
+    "accept_changed_code": {
+        "action": "store_true",
+        "help": "go on with runs whose environment's or plug-in's code is not what it was",
     },
 }
 
@@ -92,7 +97,6 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
     )
-    evaluate.add_argument("run", metavar="RUN", help="run directory")
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
     evaluate.add_argument("--env", help="another environment with the same spaces")
@@ -104,13 +108,13 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
-    inspect.add_argument("run", metavar="RUN", help="run directory")
     inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
     inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
     text = f"env steps after which an episode is cut (default {MAX_STEPS})"
     for command in (evaluate, inspect):
+        command.add_argument("run", metavar="RUN", help="run directory")
         command.add_argument("--max-steps", metavar="N", default=str(MAX_STEPS), help=text)
         most_likely = "the most likely action (default: sampled, as in training)"
         command.add_argument("--deterministic", action="store_true", help=most_likely)
@@ -137,6 +141,10 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "run a study of the paper's, or your own"
     study = commands.add_parser("study", help=text, allow_abbrev=False)
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
+    text = "run the code that the file or run names, even if another user named it"
+    for command in (train, resume, evaluate, inspect, study):
+        command.add_argument("--trust", action="store_true", help=text)
+    resume.add_argument("--accept-changed-code", **_PLACE["accept_changed_code"])
     for command in (compare, study):
         place = command.add_argument_group("where it trains")
         for name, how in _PLACE.items():
@@ -194,7 +202,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _fail(message: object, code: int) -> NoReturn:
-    print(f"sauna: {message}", file=sys.stderr)
+    """Prints one line, below the frames of the user's own code if that raised; exits."""
+    if isinstance(message, SaunaError) and (frames := user_frames(message)):
+        print(frames, file=sys.stderr)
+    print(f"sauna: {printable(str(message))}", file=sys.stderr)
     sys.exit(code)
 
 
@@ -229,7 +240,7 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    stored = _overrides_in(values.pop("config"))
+    stored = _overrides_in(values.pop("config"), values.pop("trust"))
     env = values.pop("env")
     overrides = _over(stored, values | ({"env": env} if env else {}))
     display = make_display()
@@ -248,13 +259,15 @@ def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
     return translate({k: v for k, v in stored.items() if k not in gone} | typed)
 
 
-def _overrides_in(file: str | None) -> dict[str, Any]:
+def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
     """Reads the settings of a `config.json` (of a run), or of a JSON file of plain settings."""
     if file is None:
         return {}
+    from sauna.config.trust import check_trusted
     from sauna.system.run_directory import read_config_file
 
     stored = read_config_file(Path(file))
+    check_trusted(stored, file, stored.pop("seal", None), trust)
     return overrides_of(read_stored(stored)) if "config" in stored else stored
 
 
@@ -263,9 +276,10 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    path, inexact = Path(values.pop("run")), values.pop("inexact")
+    path = Path(values.pop("run"))
+    inexact, *how = (values.pop(name) for name in ("inexact", "trust", "accept_changed_code"))
     display = make_display()
-    run = runs.reopen(path, values, display)
+    run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)
 
 
@@ -334,17 +348,18 @@ def _plot(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
-    from sauna.experiments.study.command import load_spec, study_command
+    from sauna.experiments.study.command import check_study, load_spec, study_command
 
-    name = values.pop("study")
-    _run_study(load_spec(name), study_command(name, values["out"]), **values)
+    name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
+    spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
+    _run_study(spec, study_command(name, out), **values)
 
 
-def _run_study(spec: Any, command: str, *, out: str, processes: str, on: str, address: str) -> None:
+def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:
     from sauna.experiments.study.command import lines, study
 
     jobs = whole_number({"processes": processes}, "processes", 0)
-    summary = study(spec, Path(out), command, jobs, on, address)
+    summary = study(spec, Path(out), command, jobs, **place)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")
     if not any(row["seeds"] for row in summary["table"]):
@@ -363,7 +378,7 @@ def _bench(values: dict[str, Any]) -> None:
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
+    print(printable(text), flush=True)
 
 
 def _list(values: dict[str, Any]) -> None:

@@ -34,7 +34,7 @@ LANGUAGES = {"bash", "python", "toml", "text"}
 # Commands that are parsed but not run: they need games, a cluster, a browser or hours.
 NOT_RUN = re.compile(
     r"ALE/|playground/|Flagrun|--distributed|--on ray|^sauna (study|bench|list)|--v"
-    r"|compare (?!InvertedPendulum)"
+    r"|compare (?!InvertedPendulum)|plot runs/ppo"
 )
 EXAMPLE_MODULE = """
 import gymnasium
@@ -136,7 +136,9 @@ def check_sauna(arguments: list[str]) -> None:
         return
     if parsed.command == "compare":
         settings = {k: v for k, v in settings.items() if k not in ("env", "out", "processes")}
-        comparison(parsed.env, tuple(parsed.arms.split(",")), parse_all(settings))
+        if len(parsed.env) > 1:  # runs that exist
+            return
+        comparison(parsed.env[0], tuple(parsed.arms.split(",")), parse_all(settings))
         return
     resolve(settings)
     if ":" in settings["env"]:

@@ -7,8 +7,6 @@ import sys
 from collections.abc import Callable
 
 import ale_py
-import flax.linen as nn
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from ale_py import roms
@@ -235,19 +233,9 @@ def test_a_lost_life_ends_what_is_learned_and_not_what_is_told() -> None:
     assert [e.length for e in episodes] == [6, 6]
 
 
-class Coarse(nn.Module):
-    """A trunk that compiles fast."""
-
-    @nn.compact
-    def __call__(self, observation):
-        assert observation.dtype == jnp.uint8
-        seen = observation[..., ::12, ::12, :].astype(jnp.float32) / 255.0
-        return nn.tanh(nn.Dense(8)(seen.reshape(*observation.shape[:-3], -1)))
-
-
 ATARI = {
     "preset": "atari",
-    "network": "test_atari:Coarse",
+    "network": "trunks:Coarse",
     "envs": 2,
     "rollout_steps": 16,
     "minibatches": 2,

@@ -130,7 +130,7 @@ def test_non_finite_states_are_named(monkeypatch) -> None:
 
 
 def test_episodes_longer_than_the_first_room_for_actions(monkeypatch) -> None:
-    monkeypatch.setattr("sauna.envs.host.mujoco_envs.ROOM", 8)
+    monkeypatch.setattr("sauna.envs.host.mujoco_envs.CAPACITY", 8)
     envs, again = (in_process_envs("Swimmer-v5", {}, SEEDS, "auto") for _ in range(2))
     actions = wide_actions(envs, 40, seed=3)
     envs.reset(), again.reset()
@@ -143,7 +143,7 @@ def test_episodes_longer_than_the_first_room_for_actions(monkeypatch) -> None:
 
 
 def test_room_is_made_when_another_episode_ends(monkeypatch) -> None:
-    monkeypatch.setattr("sauna.envs.host.mujoco_envs.ROOM", 3)
+    monkeypatch.setattr("sauna.envs.host.mujoco_envs.CAPACITY", 3)
     envs = in_process_envs("InvertedPendulum-v5", {"max_episode_steps": 50}, SEEDS, "auto")
     envs.reset()
     every, action = np.ones(len(SEEDS), bool), np.zeros((len(SEEDS), 1), np.float32)

@@ -43,6 +43,7 @@ ROWS: dict[int, tuple[str, str, int, int]] = {
     12: ("bad configurations", "test_12_bad_configuration", 300, 100),
     13: ("one seed of a study fails, study killed", "test_13_failing_seed", 10, 1),
     14: ("log ahead of checkpoint", "test_14_log_ahead", 100, 30),
+    15: ("hostile runs, studies and configs", "test_15_hostile_runs", 60, 60),
 }
 
 

@@ -33,7 +33,7 @@ def forge(run: Path, blob: bytes | None = None, raw: bytes | None = None, **chan
     """A checkpoint of `blob` whose manifest has `changes` (or is `raw`), digests included."""
     place = run / "checkpoints" / NUMBER
     place.mkdir(parents=True)
-    (run / "config.json").write_text("{}")
+    (run / "config.json").write_text(json.dumps({"config": {}, "spaces": []}))
     blob = good_blob() if blob is None else blob
     (place / "state.safetensors").write_bytes(blob)
     manifest = {
@@ -41,7 +41,8 @@ def forge(run: Path, blob: bytes | None = None, raw: bytes | None = None, **chan
         "iteration": int(NUMBER),
         "bytes": len(blob),
         "sha256": hashlib.sha256(blob).hexdigest(),
-        "config": {},
+        "config": {"arm": ["ppo"]},
+        "arms": {"ppo": {}},
         "members": ["ppo/0"],
         "spaces": ["vector", [3], "continuous", [2], "", ""],
         "logs": {},
@@ -130,6 +131,7 @@ def blobs() -> dict[str, bytes]:
         "shape of a bool": tensors({"a": tensor(shape=[True, 4])}),
         "shape of text": tensors({"a": tensor(shape="4")}),
         "unknown type": tensors({"a": tensor(dtype="F31")}),
+        "a type that numpy lacks": tensors({"a": tensor(dtype="F8_E4M3", shape=[16])}),
         "object type": tensors({"a": tensor(dtype="O")}),
         "type that is a list": tensors({"a": tensor(dtype=["F32"])}),
         "three offsets": tensors({"a": tensor(data_offsets=[0, 8, 16])}),

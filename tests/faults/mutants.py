@@ -1,4 +1,4 @@
-"""Small mistakes planted in `core/` and `selection/`: which share of them do the fast tests catch?
+"""Small mistakes planted in `algorithm/`: which share of them do the fast tests catch?
 
     python tests/faults/mutants.py                every mutant; results/mutants.json
     python tests/faults/mutants.py --only NAME    those whose name contains NAME; nothing is stored
@@ -29,6 +29,11 @@ QUICK = (
     "advantages",
     "samples",
     "ppo",
+    "selected",
+    "rules",
+    "loss_rules",
+    "control",
+    "draws",
     "vex_filter",
     "vex_targets",
     "networks",
@@ -111,7 +116,7 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "algorithm/learner/ppo.py",
+        "algorithm/learner/losses.py",
         "ppo samples",
         ("mean over empty slots, too", "jnp.maximum(jnp.sum(weight), 1.0)", "weight.shape[0]"),
         (
@@ -124,6 +129,17 @@ MUTANTS = [
             "centred / (jnp.sqrt(weighted_mean(centred**2, weight)) + 1e-8)",
             "centred",
         ),
+        (
+            "entropy is punished",
+            "policy_loss - hypers.entropy_coef",
+            "policy_loss + hypers.entropy_coef",
+        ),
+        ("Vex weighted as value", "hypers.vex_coef * vex_loss", "hypers.value_coef * vex_loss"),
+        ("no value loss", "total + hypers.value_coef * value_loss +", "total +"),
+    ),
+    *_of(
+        "algorithm/learner/ppo.py",
+        "ppo samples",
         (
             "optimistic surrogate",
             "jnp.maximum(-advantage * ratio",
@@ -138,35 +154,38 @@ MUTANTS = [
         ("optimistic value clip", "jnp.maximum(error,", "jnp.minimum(error,"),
         ("value error not halved", "return 0.5 * error", "return error"),
         ("clip around zero", "old + jnp.clip(value - old", "jnp.clip(value - old"),
-        (
-            "entropy is punished",
-            "policy_loss - hypers.entropy_coef",
-            "policy_loss + hypers.entropy_coef",
-        ),
-        ("Vex weighted as value", "hypers.vex_coef * vex_loss", "hypers.value_coef * vex_loss"),
-        ("no value loss", "total + hypers.value_coef * value_loss +", "total +"),
         ("KL with the wrong sign", "(ratio - 1.0) - log_ratio", "(ratio - 1.0) + log_ratio"),
         (
             "clip fraction inverted",
             "jnp.abs(ratio - 1.0) > hypers",
             "jnp.abs(ratio - 1.0) < hypers",
         ),
-        ("masked ratios count", "jnp.where(weight > 0, log_ratio, 0.0)", "log_ratio"),
+        (
+            "masked ratios count",
+            "jnp.where(rows.weight > 0, log_prob - rows.log_prob, 0.0)",
+            "log_prob - rows.log_prob",
+        ),
     ),
     *_of(
         "algorithm/learner/a2c.py",
         "a2c",
-        ("flipped advantage", "-log_prob * advantage", "log_prob * advantage"),
+        (
+            "policy gradient downhill",
+            "-log_prob * minibatch.advantage",
+            "log_prob * minibatch.advantage",
+        ),
         (
             "value error halved",
-            "(value - return_) ** 2, weight",
-            "0.5 * (value - return_) ** 2, weight",
+            "errors = (critic.value - values.return_) ** 2",
+            "errors = 0.5 * (critic.value - values.return_) ** 2",
         ),
         (
             "value and Vex loss swapped",
             "weigh(policy_loss, value_loss, vex_loss,",
             "weigh(policy_loss, vex_loss, value_loss,",
         ),
+        ("masked samples count", "jnp.where(rows.weight > 0, log_prob, 0.0)", "log_prob"),
+        ("no Vex loss", "vex_loss, mean_entropy, hypers)", "0.0 * vex_loss, mean_entropy, hypers)"),
     ),
     *_of(
         "algorithm/learner/update.py",
@@ -189,8 +208,10 @@ MUTANTS = [
         ("starts with a whole sample", "1e-4)", "1.0)"),
         (
             "inactive rows count",
-            "number = weight.sum(-2)",
-            "number = weight.sum(-2) * 0 + weight.shape[-2]",
+            'nothing changes.\n    """\n    weight = active[..., None]\n'
+            "    number = weight.sum(-2)",
+            'nothing changes.\n    """\n    weight = active[..., None]\n'
+            "    number = weight.sum(-2) * 0 + weight.shape[-2]",
         ),
         (
             "batch variance weighted by count",
@@ -214,27 +235,28 @@ MUTANTS = [
         ("no clipping", "optax.clip_by_global_norm(hypers.max_grad_norm)", "optax.identity()"),
         (
             "Adam forgets",
-            "return TrainState(params, scale)",
-            "return TrainState(params, state.optimizer)",
+            "return TrainState(params, scale, state.sampler)",
+            "return TrainState(params, state.optimizer, state.sampler)",
         ),
+        ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
+        ("minibatches repeat", "default_rng([seed, iteration])", "default_rng([seed])"),
+        ("one order for all members", "default_rng([seed, iteration])", "default_rng([iteration])"),
+        (
+            "minibatches in time order",
+            "generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)",
+            "np.tile(samples, (config.epochs, 1))",
+        ),
+    ),
+    *_of(
+        "algorithm/learner/learn.py",
+        "faults/test_07_poisoned_batch",
         ("only the loss is checked", " & jnp.all(jnp.isfinite(state.params))", ""),
+    ),
+    *_of(
+        "algorithm/learner/metrics.py",
+        "ppo samples",
         ("explained variance of a sum", "variance(return_ - value)", "variance(return_ + value)"),
         ("median off by one", "ordered[(number - 1) // 2]", "ordered[number // 2]"),
-        ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
-    ),
-    *_of(
-        "algorithm/learner/update.py",
-        "a2c",
-        ("mean square starts at 0", "initial_scale=1.0", "initial_scale=0.0"),
-        ("epsilon outside of the root", "eps_in_sqrt=True", "eps_in_sqrt=False"),
-    ),
-    *_of(
-        "algorithm/learner/a2c.py",
-        "a2c",
-        ("policy gradient downhill", "weighted_mean(-log_prob", "weighted_mean(log_prob"),
-        ("value error halved", "weighted_mean((value", "0.5 * weighted_mean((value"),
-        ("masked samples count", "jnp.where(weight > 0, log_prob, 0.0)", "log_prob"),
-        ("no Vex loss", "vex_loss, mean_entropy, hypers)", "0.0 * vex_loss, mean_entropy, hypers)"),
     ),
     *_of(
         "algorithm/policy/policy.py",
@@ -315,24 +337,132 @@ MUTANTS = [
             "jax.random.fold_in(jax.random.fold_in(root, iteration), block)",
             "jax.random.fold_in(root, iteration)",
         ),
-        ("minibatches repeat", "default_rng([seed, iteration])", "default_rng([seed])"),
-        ("one order for all members", "default_rng([seed, iteration])", "default_rng([iteration])"),
         (
-            "minibatches in time order",
-            "generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)",
-            "np.tile(samples, (config.epochs, 1))",
+            "one key for every segment",
+            "jax.random.fold_in(key, first + t)",
+            "jax.random.fold_in(key, t)",
         ),
-        ("one key for all members", "jax.random.key(seed)", "jax.random.key(0)"),
+        ("one step too many", "carry[0] < length", "carry[0] <= length"),
     ),
     *_of(
-        "algorithm/selection/vex_filter.py",
-        "vex_filter samples reference",
+        "algorithm/types.py",
+        "samples selected",
+        ("one key for all members", "jax.random.key(seed)", "jax.random.key(0)"),
+        ("draws by the key of an epoch's order", "SELECTION = 2**31 - 1", "SELECTION = 1"),
+    ),
+    *_of(
+        "algorithm/selection/history.py",
+        "vex_filter samples reference coverage",
         ("median off by one", "jnp.maximum(history.number - 1, 0) // 2", "history.number // 2"),
         (
             "history does not grow",
             "History(ordered, history.number + 1)",
             "History(ordered, history.number)",
         ),
+        ("rank off by one", "jnp.clip(rank - 1, 0,", "jnp.clip(rank, 0,"),
+    ),
+    *_of(
+        "algorithm/selection/random_drop.py",
+        "vex_filter samples",
+        ("random drop inverted", ">= hypers.drop_rate", "< hypers.drop_rate"),
+    ),
+    *_of(
+        "training/loop/budget.py",
+        "vex_filter coverage",
+        (
+            "schedule the other way",
+            '"rising": threshold * (1.0 - left)',
+            '"rising": threshold * left',
+        ),
+    ),
+    *_of(
+        "algorithm/selection/gigaflow.py",
+        "rules",
+        ("other running rate", "rate: float = 0.25", "rate: float = 0.75"),
+        ("threshold of today's largest", ">= threshold * largest", ">= threshold * now"),
+    ),
+    *_of(
+        "algorithm/selection/top_advantage.py",
+        "rules",
+        ("sign of the advantage counts", "jnp.abs(samples.advantage)", "samples.advantage"),
+    ),
+    *_of(
+        "algorithm/selection/prioritized.py",
+        "rules",
+        ("corrected the other way", "** -b, 0.0)", "** b, 0.0)"),
+        ("correction does not rise", "(1.0 - correction) * progress", "0.0 * progress"),
+    ),
+    *_of(
+        "algorithm/selection/gradient_norm.py",
+        "rules",
+        ("weights of all slots", "_inverse(number * p)", "_inverse(len(p) * p)"),
+        ("biases forgotten", "jnp.sum(hidden**2, -1) + 1.0", "jnp.sum(hidden**2, -1)"),
+    ),
+    *_of(
+        "algorithm/selection/pods.py",
+        "rules",
+        ("last segment cut off", "pieces = -(-steps // length)", "pieces = steps // length"),
+    ),
+    *_of(
+        "algorithm/selection/scores.py",
+        "rules control",
+        (
+            "one row too many",
+            "found = jax.lax.top_k(jnp.where(eligible, score, -jnp.inf), count)",
+            "found = jax.lax.top_k(jnp.where(eligible, score, -jnp.inf), count + 1)",
+        ),
+    ),
+    *_of(
+        "algorithm/selection/delight.py",
+        "loss_rules",
+        ("likely and good", "jnp.clip(-log_prob - centre", "jnp.clip(log_prob + centre"),
+    ),
+    *_of(
+        "algorithm/selection/stops.py",
+        "loss_rules",
+        ("KL with the wrong sign", "- 1.0 - log_ratio", "- 1.0 + log_ratio"),
+    ),
+    *_of(
+        "algorithm/selection/control.py",
+        "control",
+        ("low advantage is high", "largest(-jnp.abs(advantage)", "largest(jnp.abs(advantage)"),
+        (
+            "absent rows deal weights",
+            "rows[(jnp.cumsum(present) - 2)",
+            "rows[(jnp.cumsum(present) - 1)",
+        ),
+        ("first step at risk", "return chosen | (keep & first)", "return chosen"),
+    ),
+    *_of(
+        "algorithm/selection/draws.py",
+        "draws selected",
+        ("drawn by the left edge", 'side="right"', 'side="left"'),
+        ("last minibatch left out", "(number + full - 1) // full", "number // full"),
+        ("steps without a row", "jnp.minimum(number, minibatches)", "minibatches"),
+    ),
+    *_of(
+        "algorithm/learner/selected.py",
+        "selected",
+        (
+            "the step that is forbidden is taken",
+            "jnp.where(stop, old, new)",
+            "jnp.where(stop, new, new)",
+        ),
+        (
+            "the critic loses rows, too",
+            "choice = Choice(keep=present)",
+            "choice = Choice(keep=choice.keep)",
+        ),
+        (
+            "weights of rows drawn otherwise",
+            "choice.value_weight if for_all else None",
+            "choice.value_weight",
+        ),
+        ("one order for all epochs", "order[e]", "order[0]"),
+    ),
+    *_of(
+        "algorithm/selection/vex_filter.py",
+        "vex_filter samples reference",
         ("filter inverted", "~(ratio < threshold)", "~(ratio > threshold)"),
         ("strict threshold", "~(ratio < threshold)", "~(ratio <= threshold)"),
         ("first step compared with nothing", "(history.number == 0) | ", ""),
@@ -343,13 +473,6 @@ MUTANTS = [
             "(median(history) + EPSILON)",
         ),
         ("joint decision by the largest", "jnp.mean(vex), state", "jnp.max(vex), state"),
-        ("random drop inverted", ">= hypers.drop_rate", "< hypers.drop_rate"),
-        (
-            "one key for every stretch",
-            "jax.random.fold_in(key, first + t)",
-            "jax.random.fold_in(key, t)",
-        ),
-        ("one step too many", "carry[0] < length", "carry[0] <= length"),
     ),
     *_of(
         "algorithm/selection/vex_filter.py",
@@ -360,12 +483,6 @@ MUTANTS = [
             "(rate * number - state.kept) / SETTLE",
         ),
         ("share dropped for share kept", "level = (1.0 - rate) +", "level = rate +"),
-        ("rank off by one", "jnp.clip(rank - 1, 0,", "jnp.clip(rank, 0,"),
-        (
-            "schedule the other way",
-            '"rising": threshold * (1.0 - left)',
-            '"rising": threshold * left',
-        ),
     ),
     *_of(
         "experiments/measure/gradient.py",
@@ -392,9 +509,9 @@ MUTANTS = [
             "_mean(residual**2, weight)",
         ),
         (
-            "stretches not centred",
-            "over_stretch((return_ - over_stretch(return_)) ** 2)",
-            "over_stretch(return_**2)",
+            "segments not centred",
+            "over_segment((return_ - over_segment(return_)) ** 2)",
+            "over_segment(return_**2)",
         ),
         ("other clip", "CLIP_BELOW = -5.0", "CLIP_BELOW = -10.0"),
         ("rounding counts as variance", "ROUNDING = 1e-8", "ROUNDING = 0.0"),
@@ -413,8 +530,8 @@ MUTANTS = [
 
 # Survivors that are no mistakes: the program they make is the same one.
 EQUIVALENT = {
-    "core/batch.py: stream goes on at its end": "behind the last row there is nothing: the sum "
-    "over later steps starts at 0, which the mask multiplies",
+    "algorithm/learner/samples.py: stream goes on at its end": "behind the last row there is "
+    "nothing: the sum over later steps starts at 0, which the mask multiplies",
 }
 
 

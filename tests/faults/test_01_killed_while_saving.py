@@ -1,4 +1,4 @@
-"""Row 1: cut off anywhere in a save or a prune, the old checkpoint or the new one is there."""
+"""Row 1: cut off any_member in a save or a prune, the old checkpoint or the new one is there."""
 
 from __future__ import annotations
 

@@ -80,6 +80,8 @@ def _other(name: str, value: Any) -> Any:
         return {"speed": 2}
     if name in OTHERS:
         return OTHERS[name]
+    if isinstance(value, dict):
+        return {"other": 1}
     if FIELDS[name].metadata["choices"]:
         return next(c for c in FIELDS[name].metadata["choices"] if c != value and c != "auto")
     return not value if TYPES[name] is bool else value + 1
@@ -171,12 +173,16 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     """Its rows are kept, its policy acts, and it is trained to its end."""
     run = tmp_path / "run"
     shutil.copytree(golden, run)
-    loaded = load_artifact(run)
+    loaded = load_artifact(run, trust=True)
     assert loaded.checkpoint.manifest["format"] == checkpoint.FORMAT
     spaces = loaded.spaces
-    assert sauna.load(run)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
+    with pytest.raises(BadInput, match=r"names code .* give --trust"):
+        sauna.load(run)  # it was made by somebody else, whose key is not here
+    assert (
+        sauna.load(run, trust=True)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
+    )
     with trained_here():
-        sauna.resume(run)
+        sauna.resume(run, trust=True)
     assert run_directory.is_complete(run)
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()
@@ -189,7 +195,7 @@ def test_an_old_run_ends_alike_under_other_presets(tmp_path: Path, monkeypatch) 
     for name in ("first", "second"):
         shutil.copytree(GOLDEN / "format-1-host", tmp_path / name)
         with trained_here():
-            sauna.resume(tmp_path / name, quiet=True)
+            sauna.resume(tmp_path / name, quiet=True, trust=True)
         newest = checkpoint.load_newest(tmp_path / name / "checkpoints", print)
         assert newest is not None and newest.manifest["arms"] == {"ppo": {}}
         ended.append((newest.manifest["sha256"], (tmp_path / name / "metrics.jsonl").read_bytes()))

@@ -143,5 +143,5 @@ def test_parameters_are_checked_where_the_loss_was_still_finite() -> None:
 def test_a_rate_that_overflows_stops_before_anything_is_saved() -> None:
     recorder = Recorder()
     with pytest.raises(NonFinite, match="iteration 0"):
-        host.train_members(make_job("worlds:Scripted", learning_rate=1e38), recorder)
+        host.train_on_host(make_job("worlds:Scripted", learning_rate=1e38), recorder)
     assert not recorder.rows and not recorder.states

@@ -197,22 +197,31 @@ def wrong_config_file(rng: random.Random) -> Mistake:
     )
 
 
+STUDY = ("study", "{file}", "--trust")  # its environment is of a module
+
+
 def wrong_study(rng: random.Random) -> Mistake:
     start = 'tasks = ["worlds:Scripted"]\n'
     arm = '[[arms]]\nlabel = "ppo"\n'
     return rng.choice(
         [
             Mistake(["study", "fig33"], "did you mean"),
-            Mistake(["study", "{file}"], "cannot read", "tasks = ["),
-            Mistake(["study", "{file}"], "unknown key", f'task = ["x"]\n{arm}'),
-            Mistake(["study", "{file}"], "no arms", start),
-            Mistake(["study", "{file}"], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'),
-            Mistake(["study", "{file}"], "minibatches", f"minibatches = 7\n{start}{arm}"),
+            Mistake([*STUDY], "cannot read", "tasks = ["),
+            Mistake([*STUDY], "unknown key", f'task = ["x"]\n{arm}'),
+            Mistake([*STUDY], "no arms", start),
+            Mistake([*STUDY], "unknown arm", f'{start}[[arms]]\nlabel = "suana"\n'),
+            Mistake([*STUDY], "minibatches", f"minibatches = 7\n{start}{arm}"),
             Mistake(
-                ["study", "{file}"], "gamma", f"gamma = {rng.uniform(1.1, 9):.3f}\n{start}{arm}"
+                [*STUDY],
+                "gamma",
+                f"gamma = {rng.uniform(1.1, 9):.3f}\n{start}{arm}",
             ),
-            Mistake(["study", "{file}", "--processes", "-1"], "processes:", start + arm),
-            Mistake(["study", "{file}", "--on", "mars"], "invalid choice: 'mars'", start + arm),
+            Mistake([*STUDY, "--processes", "-1"], "processes:", start + arm),
+            Mistake(
+                [*STUDY, "--on", "mars"],
+                "invalid choice: 'mars'",
+                start + arm,
+            ),
             Mistake(["compare", WORLD, "--arms", "ppo,ppo"], "twice"),
             Mistake(["compare", WORLD, "--arms", "ppo,suana"], "did you mean 'sauna'?"),
             Mistake(["compare", WORLD, "--gamma", "1.5"], "gamma"),
@@ -311,7 +320,8 @@ def _judge(
     what = " ".join(arguments)
     if code != 2 or said not in errors:
         tally.miss(f"{what}: {code}, {errors[:300]!r} instead of {said!r}")
-    if not errors.startswith("sauna: ") or errors.count("\n") != 1:
+    *frames, line = errors.splitlines() or [""]  # above it, where the user's own code raised
+    if not line.startswith("sauna: ") or (frames and "worlds.py" not in frames[0]):
         tally.lose(f"{what}: not one line: {errors[:300]!r}")
     if any(folder.iterdir()):
         tally.lose(f"{what}: created {list(folder.iterdir())}")

@@ -93,7 +93,7 @@ def test_compiled_calls_per_rollout() -> None:
 
 
 def test_a_network_of_another_kind_acts_by_one_call_per_step() -> None:
-    trainer = Trainer("worlds:Scripted", arm="ppo", network="test_networks:Sine")
+    trainer = Trainer("worlds:Scripted", arm="ppo", network="trunks:Sine")
     trainer.iterate(0)
     trainer.calls.clear()
     assert trainer.iterate(1) == STEPS
@@ -104,7 +104,7 @@ def test_a_network_of_another_kind_acts_by_one_call_per_step() -> None:
 
 @pytest.mark.parametrize("arm", ["ppo", "sauna"])
 def test_nothing_is_compiled_after_the_first_iteration(arm: str) -> None:
-    """A filtered arm drops nothing at first, and then so much that its stretches are short."""
+    """A filtered arm drops nothing at first, and then so much that its segments are short."""
     settings = {"threshold": 0.0} if arm == "sauna" else {}
     trainer = Trainer("InvertedPendulum-v5", arm=arm, rollout_steps=256, **settings)
     trainer.iterate(0)

@@ -206,7 +206,9 @@ def test_reference_preset_equals_the_released_runner(threshold: float) -> None:
         assert collected.kept_steps == T * N
         dropped += expected["steps"] - T
         shaped = {
-            k: np.asarray(v).reshape((T, N, *v.shape[1:])) for k, v in batch._asdict().items()
+            k: np.asarray(v).reshape((T, N, *v.shape[1:]))
+            for k, v in batch._asdict().items()
+            if v is not None
         }
         np.testing.assert_allclose(shaped["observation"], expected["obs"], atol=1e-6)
         np.testing.assert_allclose(shaped["value"], expected["value"], atol=1e-6)

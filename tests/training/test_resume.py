@@ -1,4 +1,4 @@
-"""A run interrupted anywhere and resumed ends with the bytes of a run left alone."""
+"""A run interrupted any_member and resumed ends with the bytes of a run left alone."""
 
 from __future__ import annotations
 
@@ -195,8 +195,10 @@ def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None
     stored["config"]["gamma"] = 0.99
     stored["config"]["env"] = "worlds:Endless"
     path.write_text(json.dumps(stored))
-    with pytest.raises(BadInput, match="other spaces"):
+    with pytest.raises(BadInput, match=r"names code .* env 'worlds:Endless'"):
         sauna.resume(run, quiet=True)
+    with pytest.raises(BadInput, match="other spaces"):
+        sauna.resume(run, quiet=True, trust=True)
 
 
 def test_where_rows_were_lost_an_older_checkpoint_is_used(tmp_path, capsys) -> None:

@@ -1,7 +1,7 @@
 """The data that flows through one iteration, as declared types.
 
 Axes: `S` env steps tried in a rollout, `T` kept steps per env, `N` envs of one member, `B` samples
-of a minibatch. Everything here belongs to one member; only `population.py` knows of several.
+of a minibatch. Everything here belongs to one member; `rollout/program.py` alone knows of several.
 """
 
 from __future__ import annotations
@@ -93,9 +93,12 @@ class Keys(NamedTuple):
     order: Array  # of minibatches drawn on the accelerator; see `minibatch_order`
 
 
+SELECTION = 2**31 - 1  # no epoch has this number: epoch e's order has the key of number e
+
+
 def selection_key(keys: Keys, iteration: Any) -> Array:
     """The key of an iteration's draws by a rule of selection, on the host and on the device."""
-    return jax.random.fold_in(jax.random.fold_in(keys.order, iteration), 1)
+    return jax.random.fold_in(jax.random.fold_in(keys.order, iteration), SELECTION)
 
 
 def member_keys(seed: int) -> Keys:
@@ -199,7 +202,7 @@ class Sampler(NamedTuple):
       init: `() -> state`; the state is carried over iterations and checkpointed.
       choose: `(state, samples, key) -> (state, choice)`.
       share: static, the most that a choice takes: arrays have `K = ceil(share * M)` rows.
-      reads_policy: whether `samples` tell of today's policy, which takes one forward pass.
+      reads_policy: whether `samples` hold those of today's policy, which takes one forward pass.
       each_epoch: choose before each epoch instead of once per iteration.
     """
 

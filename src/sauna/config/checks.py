@@ -9,6 +9,9 @@ from sauna.config.plugins import import_name, is_local
 from sauna.config.settings import FIELDS, Config, fields_with
 from sauna.system.errors import BadInput
 
+MIN_MINIBATCH = 2  # samples; of fewer, nothing can be standardised
+SMALL_MINIBATCH = 16  # samples; below, a run says so
+
 
 def is_read(name: str, config: Config) -> bool:
     """Returns whether a run with this config reads field `name`."""
@@ -69,6 +72,12 @@ def check_consistent(config: Config) -> None:
     if batch % config.minibatches:
         raise BadInput(
             f"minibatches: {config.minibatches} does not divide rollout_steps x envs = {batch}"
+        )
+    size = batch // config.minibatches
+    if size < MIN_MINIBATCH and config.normalize_advantages:
+        raise BadInput(
+            f"minibatches: {config.minibatches} of {batch} samples leave {size} each, whose "
+            f"standardised advantage is 0; at least {MIN_MINIBATCH} are needed"
         )
     if config.steps < batch:
         raise BadInput(f"steps: {config.steps} is less than one rollout of {batch} steps")
@@ -139,3 +148,11 @@ def own_parts(config: Config) -> list[str]:
     """Names the fields that hold a part of the user's own besides the environment."""
     names = (name for name in fields_with("plugin") if name != "env")
     return [name for name in names if ":" in getattr(config, name)]
+
+
+def cautions(config: Config) -> list[str]:
+    """Says what can be trained with, but seldom is meant."""
+    size = config.rollout_steps * config.envs // config.minibatches
+    if size < SMALL_MINIBATCH and config.normalize_advantages and config.algorithm == "ppo":
+        return [f"warning: minibatches of {size} samples: their advantages are standardised alone"]
+    return []

@@ -253,6 +253,9 @@ class Config:
         0.5, "weight of the Vex loss (c2 of eq. 6)", at_least=0, shapes_program=False
     )
     filter: str = _rule("sauna", "which transitions the update keeps", choices=FILTERS, plugin=True)
+    filter_kwargs: str = _rule(
+        "{}", "arguments of your own filter, as a JSON object", read_when=readers.OWN_FILTER
+    )
     sampler: str = _selection(
         "none",
         "which of the rollout's samples the update learns from, once advantages are known",

@@ -82,7 +82,7 @@ ADVICE = {
     "desired_kl": "there is no step size by KL divergence here; see learning_rate_schedule",
     "max_iterations": "give steps: iterations x envs x rollout_steps",
     "num_iterations": "give steps: iterations x envs x rollout_steps",
-    "capture_video": "`sauna eval RUN --video` films a trained policy",
+    "capture_video": "`sauna eval RUN --video` records a trained policy",
     "torch_deterministic": "a run repeats itself to the bit by itself",
     "verbose": "`quiet=True` in Python shows nothing",
     "use_sde": "there is no state-dependent exploration here",

@@ -32,12 +32,15 @@ def read_value(name: str, value: Any, field_type: Any) -> Any:
     if typing.get_origin(field_type) is tuple:
         item = typing.get_args(field_type)[0]
         parts = value.split(",") if isinstance(value, str) else list(value)
+        if len(parts) > MAX_VALUES:
+            raise BadInput(f"{name}: {len(parts)} values are too many; at most {MAX_VALUES}")
         return tuple(str(part).strip() if item is str else _integer(part) for part in parts)
     if not isinstance(value, str):
         raise TypeError
     return value
 
 
+MAX_VALUES = 100  # of a list, such as the arms or the widths of layers
 _BOOLEANS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
 
@@ -67,6 +70,8 @@ def _seeds(value: Any) -> tuple[int, ...]:
                 f"seeds: {number} is too many; for the one seed {number} write --seed {number}"
             )
         return tuple(range(number))
+    if len(value) > MAX_SEEDS:
+        raise BadInput(f"seeds: {len(value)} are too many; at most {MAX_SEEDS}")
     return tuple(_integer(seed) for seed in value)
 
 

@@ -1,7 +1,7 @@
 """Named settings: presets, arms (which selection method), and how a run's config is resolved.
 
 A preset says how an algorithm trains; an arm says which transitions the update keeps. METHOD, in
-`docs/algorithm.md`, gives the origin of every number.
+`docs/concepts/ppo.md`, gives the origin of every number.
 """
 
 from __future__ import annotations

@@ -31,6 +31,7 @@ THRESHOLD = (
 SAUNA = ("filter sauna", lambda c: c.filter == "sauna")
 SEVERAL = ("filter sauna and several envs", lambda c: c.filter == "sauna" and c.envs > 1)
 RANDOM = ("filter random-drop", lambda c: c.filter == "random-drop")
+OWN_FILTER = ("a filter of your own, module:name", lambda c: ":" in c.filter)
 SAMPLER = ("a sampler", lambda c: c.sampler != "none")
 MASKED = (
     "a sampler, or a filter with dropped=mask",

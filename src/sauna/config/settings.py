@@ -40,7 +40,7 @@ def parse(name: str, value: Any) -> Any:
     field_type, meta = TYPES[name], FIELDS[name].metadata
     try:
         parsed = read_value(name, value, field_type)
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError):
         expected = getattr(field_type, "__name__", str(field_type))
         raise BadInput(f"{name}: cannot read {value!r} as {expected}") from None
     named = meta["plugin"] and ":" in str(parsed)
@@ -56,6 +56,8 @@ def parse(name: str, value: Any) -> Any:
 def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:
     if isinstance(value, str | bool):
         return
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise BadInput(f"{name}: must be a number of at most 63 bits")
     if not math.isfinite(value):
         raise BadInput(f"{name}: must be a finite number, not {value}")
     if meta["at_least"] is not None and value < meta["at_least"]:

@@ -75,7 +75,7 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
     try:
         state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))
-        told = jax.eval_shape(one.step, state, action)
+        transition = jax.eval_shape(one.step, state, action)
     except Exception as error:  # whatever a user's environment raises when traced
         raise BadInput(f"env: {env} cannot be played: {one_line(error)}") from error
     once = {
@@ -85,9 +85,11 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
         "truncated": (),
     }
     for name, shape in once.items():
-        if getattr(told, name).shape != shape or (name == "observation" and first.shape != shape):
+        if getattr(transition, name).shape != shape or (
+            name == "observation" and first.shape != shape
+        ):
             raise BadInput(f"env: {env}: its {name} is not of shape {shape}")
-    if _arrays(told.state) != _arrays(state):
+    if _arrays(transition.state) != _arrays(state):
         raise BadInput(f"env: {env}: its state has other arrays after a step than after a reset")
 
 

@@ -21,8 +21,9 @@ class Spaces(NamedTuple):
     observation_shape: tuple[int, ...]
     action_kind: str  # continuous | discrete | multi_discrete | multi_binary
     action_sizes: tuple[int, ...]  # (A,), (choices,), (choices, choices, ...), (bits,)
-    observation_text: str  # as Gymnasium prints them, to compare with a checkpoint's
-    action_text: str
+    # Of parts that are flattened, their order and sizes; runs of 0.1.0 hold Gymnasium's text.
+    observation_structure: Any
+    action_structure: Any
     observation_high: float = 255.0  # of an image's bytes: the networks here divide by it
 
     @property
@@ -41,17 +42,51 @@ class Spaces(NamedTuple):
 
 
 def read_spaces(values: list[Any]) -> Spaces:
-    """`Spaces` back from its JSON form, where tuples have become lists."""
-    fields: list[Any] = [tuple(v) if isinstance(v, list) else v for v in values]
-    return Spaces(*fields)
+    """`Spaces` back from its JSON form, where tuples have become lists.
+
+    Raises:
+      TypeError, ValueError: they are none.
+    """
+    spaces = Spaces(*map(_tuples, values))
+    for sizes in (spaces.observation_shape, spaces.action_sizes):
+        if not isinstance(sizes, tuple) or not all(
+            type(n) is int and 0 <= n < 2**31 for n in sizes
+        ):
+            raise ValueError(f"{sizes} are no sizes")
+    return spaces
 
 
-def same_spaces(stored: Any, found: Spaces) -> bool:
-    """Whether a run's stored spaces are those that an environment has."""
-    try:
-        return read_spaces(stored) == read_spaces(list(found))
-    except TypeError:  # not what a run writes
-        return False
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def difference(before: Spaces, now: Spaces) -> str:
+    """What of the spaces is not as it was, for a message; empty where a learner sees no difference.
+
+    Bounds and types of numbers are no part of it: the learner does not read them.
+    """
+    for name in Spaces._fields:
+        old, new = getattr(before, name), getattr(now, name)
+        if name.endswith("structure") and not (isinstance(old, tuple) and isinstance(new, tuple)):
+            continue  # text, of 0.1.0
+        if old != new:
+            return f"{name.replace('_', ' ')} {old} instead of {new}"
+    return ""
+
+
+def _structure(space: Any) -> tuple[Any, ...]:
+    """The kind of a space, and of its parts in the order in which they are flattened."""
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Dict):
+        return ("Dict", *((str(name), _structure(part)) for name, part in space.spaces.items()))
+    if isinstance(space, gym.Tuple):
+        return ("Tuple", *map(_structure, space.spaces))
+    if isinstance(space, gym.Discrete):
+        return ("Discrete", int(space.n))
+    if isinstance(space, gym.MultiDiscrete):
+        return ("MultiDiscrete", *map(int, space.nvec.ravel()))
+    return (type(space).__name__, *map(int, space.shape or ()))
 
 
 def describe(observation_space: Any, action_space: Any) -> Spaces:
@@ -63,8 +98,8 @@ def describe(observation_space: Any, action_space: Any) -> Spaces:
     kind, shape = describe_observation(observation_space)
     high = float(observation_space.high.max(initial=0)) if kind == "image" else 0.0
     action_kind, sizes = _describe_action(action_space)
-    texts = str(observation_space), str(action_space)
-    return Spaces(kind, shape, action_kind, sizes, *texts, high or 255.0)
+    parts = _structure(observation_space), _structure(action_space)
+    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0)
 
 
 def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:

@@ -13,8 +13,9 @@ from sauna.envs.host.contract import HostEnvs, Snapshot, Step
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import read_spaces
-from sauna.system.errors import SaunaError
+from sauna.system.errors import SaunaError, one_line
 from sauna.system.processes import Message, child_ends, receive, send, start_worker
+from sauna.system.tracebacks import cause_of, describe_failure
 
 STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
 NOTICE = 0.2  # seconds after which the end of a worker is noticed while another one is awaited
@@ -124,7 +125,8 @@ class ProcessEnvs(HostEnvs):
             code = worker.process.wait()
             raise EnvironmentFailure(f"{name} ended with exit code {code}") from None
         if message.header["kind"] == "failure":
-            raise EnvironmentFailure(f"{name}: {message.header['message']}")
+            error = EnvironmentFailure(f"{name}: {message.header['message']}")
+            raise error from cause_of(message.header)
         return message
 
     def _wait_for(self, number: int, timeout: float) -> bool:
@@ -165,8 +167,9 @@ def main() -> None:
             send(outbox, {"kind": "answer"}, _serve(envs, receive(inbox)))
     except (EOFError, BrokenPipeError):
         return
-    except SaunaError as error:
-        send(outbox, {"kind": "failure", "message": str(error)})
+    except Exception as error:
+        text = str(error) if isinstance(error, SaunaError) else one_line(error)
+        send(outbox, {"kind": "failure", "message": text, **describe_failure(error, False)})
 
 
 if __name__ == "__main__":

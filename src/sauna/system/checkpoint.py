@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,13 +24,14 @@ from safetensors.numpy import load, save
 
 from sauna.system.errors import SaunaError
 from sauna.system.migrations import with_arms
-from sauna.system.safe_read import JSON_BYTES, Untrusted, check_tensors, parse_object, read_file
+from sauna.system.safe_read import JSON_BYTES, Untrusted, check_header, parse_object, read_file
+from sauna.system.safe_write import own_folder, sync_folder, write_durably
 
 FORMAT = 2
 LARGEST = 2**34  # bytes of a state that are read at most
 # How a manifest of an older format becomes one of the next, by the older one's number.
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {1: with_arms}
-# What a manifest holds; the last five are of a run.
+# What a manifest holds; the last six are of a run.
 TYPES = {
     "format": int,
     "iteration": int,
@@ -40,6 +42,7 @@ TYPES = {
     "spaces": list,
     "members": list,
     "logs": dict,
+    "log_digests": dict,
 }
 
 
@@ -90,14 +93,15 @@ def save_checkpoint(
         **manifest,
     }
     manifest["manifest_sha256"] = _digest(manifest)
-    if final.exists():
+    own_folder(folder)
+    if os.path.lexists(final):
         if _holds(final, manifest):  # saved before the run was stopped here
             return final
         final.rename(_free_name(final))
     for left in folder.glob(".writing-*"):
-        shutil.rmtree(left)
-    temporary = folder / f".writing-{iteration:08d}"
-    temporary.mkdir(parents=True)
+        left.unlink() if left.is_symlink() or left.is_file() else shutil.rmtree(left)
+    temporary = folder / f".writing-{iteration:08d}-{secrets.token_hex(8)}"
+    temporary.mkdir()
     sync_folder(folder.parent)
     write_durably(temporary / "state.safetensors", blob)
     write_durably(temporary / "manifest.json", json.dumps(manifest, indent=1).encode())
@@ -117,37 +121,30 @@ def _digest(manifest: dict[str, Any]) -> str:
 
 def _holds(path: Path, manifest: dict[str, Any]) -> bool:
     """Whether a checkpoint is good, has these arrays, and counts on these logs."""
+    if path.is_symlink():
+        return False
     try:
         found = load_checkpoint(path).manifest
     except BadCheckpoint:
         return False
-    same_arrays = found["sha256"] == manifest["sha256"]
-    return bool(same_arrays and found["logs"] == manifest.get("logs", {}))
+    names = ("sha256", "logs", "log_digests")
+    return all(found[name] == manifest.get(name, {}) for name in names)
 
 
 def _free_name(path: Path) -> Path:
     """Where a checkpoint that cannot be used is kept: `NUMBER.bad`, `NUMBER.bad2`, ..."""
     names = (path.with_name(f"{path.name}.bad{i or ''}") for i in [0, *range(2, 1000)])
-    return next(name for name in names if not name.exists())
-
-
-def write_durably(path: Path, data: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def numbered(folder: Path) -> list[Path]:
-    """The finished checkpoints of a run, oldest first."""
+    """The finished checkpoints of a run, oldest first.
+
+    Raises:
+      BadCheckpoint: their folder is a link, or something else.
+    """
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise BadCheckpoint(f"{folder} is not a folder (nothing is read through links)")
     found = folder.glob("[0-9]" * 8)
     return sorted(path for path in found if path.is_dir() and not path.is_symlink())
 
@@ -170,9 +167,22 @@ def load_checkpoint(
         blob = read_file(path / "state.safetensors", min(manifest["bytes"], LARGEST))
         if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
             raise Untrusted("state.safetensors is not what was written (SHA-256 differs)")
-        check_tensors(blob)
+        check_header(blob)
         return Checkpoint(path, manifest, load(blob))
-    except (Untrusted, SafetensorError) as error:
+    except (Untrusted, SafetensorError, KeyError) as error:  # KeyError: a type that numpy lacks
+        raise BadCheckpoint(f"{path}: {error}") from error
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a checkpoint.
+
+    Raises:
+      BadCheckpoint: it cannot be trusted.
+      NewerFormat: only a newer version can read it.
+    """
+    try:
+        return _manifest(path)
+    except Untrusted as error:
         raise BadCheckpoint(f"{path}: {error}") from error
 
 
@@ -209,6 +219,11 @@ def _check_types(manifest: dict[str, Any]) -> None:
     for name, size in manifest["logs"].items():
         if Path(name).name != name or type(size) is not int or size < 0:
             raise Untrusted("manifest.json: logs are not names of files and their sizes")
+    for name, digest in manifest["log_digests"].items():
+        if name not in manifest["logs"] or type(digest) is not str:
+            raise Untrusted("manifest.json: log_digests are not SHA-256 of its logs")
+    if not all(type(name) is str for name in manifest["members"]):
+        raise Untrusted("manifest.json: members are not names")
 
 
 def load_newest(

@@ -34,3 +34,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def one_line(error: BaseException) -> str:
     """Type and message of somebody else's exception, in one line of bounded length."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+
+
+def printable(text: str) -> str:
+    """A text in one line, without characters that a terminal would act on."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

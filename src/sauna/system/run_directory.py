@@ -1,6 +1,7 @@
 """The run directory: what is in it, who may write to it, and how its logs are cut back.
 
 config.json     the settings and what each arm differs in, versions, git revision, machine
+failure.txt     the traceback of what ended it last, if something did
 metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
 summary.json    how each member ended
@@ -21,14 +22,25 @@ import platform
 import shlex
 import subprocess
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.system.checkpoint import BadCheckpoint, sync_folder, write_durably
-from sauna.system.errors import BadInput, SaunaError
+from sauna.system.errors import BadInput
+from sauna.system.logs import NAMES as LOGS
+from sauna.system.logs import read_rows
 from sauna.system.safe_read import JSON_BYTES, Untrusted, parse_object, read_file
+from sauna.system.safe_write import is_unfinished, open_grown, replace_file, sync_folder
 
-LOGS = ("metrics.jsonl", "timing.jsonl")
+# What a run's config.json holds that is read again, by its type.
+_PARTS: dict[str, type] = {
+    "config": dict,
+    "given": dict,
+    "spaces": list,
+    "drop_rates": list,
+    "code": dict,
+    "code_before": list,
+}
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -104,7 +116,7 @@ def discard(path: Path, made: bool) -> None:
 
 def _counts(path: Path) -> bool:
     """Whether a file makes a folder a used one; what a kill cut short does not."""
-    return path.name != ".lock" and not path.name.endswith(".writing")
+    return path.name != ".lock" and not is_unfinished(path)
 
 
 class InUse(BadInput):
@@ -116,8 +128,9 @@ def lock(path: Path) -> IO[str]:
 
     Raises:
       InUse: another process holds it; its number is named.
+      Untrusted: the lock is a link, or no regular file.
     """
-    file = (path / ".lock").open("a+")
+    file: IO[str] = open_grown(path / ".lock", "a+")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         file.truncate(0)
@@ -150,22 +163,36 @@ def _holder(file: IO[str]) -> str:
 
 def write_json(path: Path, value: Any) -> None:
     """Atomically: a reader sees the old file or the new one."""
-    temporary = path.with_name(f".{path.name}.writing")
-    write_durably(temporary, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
-    temporary.replace(path)
-    sync_folder(path.parent)
+    replace_file(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_config(run: Path) -> dict[str, Any]:
-    """`config.json` of a run.
+def read_config(run: Path, needed: tuple[str, ...] = ("config", "spaces")) -> dict[str, Any]:
+    """`config.json` of a run: what is `needed` is there, and what is there is of its type.
 
     Raises:
-      BadInput: there is no run, or its config cannot be read.
+      BadInput: there is no run, or its config is not one.
     """
     path = run / "config.json"
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise BadInput(f"{run} is not a run directory (it has no config.json)")
-    return read_config_file(path)
+    stored = _read(path)
+    for name, kind in _PARTS.items():
+        missing = None if name in needed else kind()
+        if type(stored.get(name, missing)) is not kind:
+            noun = "a table" if kind is dict else "a list"
+            raise BadInput(f"config: {path}: {name} is missing or is not {noun}")
+    return stored
+
+
+def write_config(run: Path, stored: Mapping[str, Any]) -> None:
+    """Writes `config.json`, atomically."""
+    write_json(run / "config.json", stored)
+
+
+def with_code(stored: Mapping[str, Any], code: Mapping[str, str]) -> dict[str, Any]:
+    """A stored config whose run goes on with other code; what it was before is kept."""
+    before = [*stored.get("code_before", []), stored["code"]] if "code" in stored else []
+    return {**stored, "code": dict(code), "code_before": before}
 
 
 def read_config_file(path: Path) -> dict[str, Any]:
@@ -174,71 +201,29 @@ def read_config_file(path: Path) -> dict[str, Any]:
     Raises:
       BadInput: the file cannot be read as that.
     """
+    return _read(path, Path(os.path.realpath(path)))
+
+
+def _read(path: Path, place: Path | None = None) -> dict[str, Any]:
     try:
-        return parse_object(read_file(path.resolve(), JSON_BYTES))
+        return parse_object(read_file(place or path, JSON_BYTES))
     except Untrusted as error:
         raise BadInput(f"config: cannot read {path}: {error}") from error
 
 
 def rows(run: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
-    """All rows of a log; an unfinished last line (of a run in progress) is left out.
-
-    So is everything behind a line that a power cut has spoilt: a resume cuts that off.
+    """All rows of a log; see `logs.read_rows`.
 
     Raises:
       SaunaError: a row of a complete run cannot be read; its line is named.
     """
-    path = run / name
-    found: list[dict[str, Any]] = []
-    if not path.is_file():
-        return found
-    for number, line in enumerate(path.read_bytes().splitlines(True), 1):
-        try:
-            if line.endswith(b"\n"):
-                found.append(json.loads(line))
-        except ValueError as error:
-            if is_complete(run):
-                raise SaunaError(f"{path}: line {number} is damaged: {error}") from error
-            break
-    return found
+    return read_rows(run / name, is_complete(run))
 
 
 def is_complete(run: Path) -> bool:
     """Whether the run was trained to its end."""
     path = run / "summary.json"
-    return path.is_file() and bool(read_config_file(path).get("complete"))
-
-
-def log_sizes(run: Path) -> dict[str, int]:
-    """Bytes of each log, all of them flushed to disk: a checkpoint counts on them."""
-    for name in LOGS:
-        if (run / name).exists():
-            descriptor = os.open(run / name, os.O_RDONLY)
-            os.fsync(descriptor)
-            os.close(descriptor)
-    return {name: (run / name).stat().st_size for name in LOGS if (run / name).exists()}
-
-
-def check_logs(run: Path, sizes: dict[str, int]) -> None:
-    """Whether the logs still hold the rows that a checkpoint counts on.
-
-    Raises:
-      BadCheckpoint: a log is shorter than the checkpoint says; rows were lost.
-    """
-    for name in LOGS:
-        path, size = run / name, sizes.get(name, 0)
-        if (path.stat().st_size if path.exists() else 0) < size:
-            raise BadCheckpoint(
-                f"{path} is shorter than when the checkpoint was saved; rows are lost"
-            )
-
-
-def cut_logs(run: Path, sizes: dict[str, int]) -> None:
-    """Brings the logs back to a checkpoint: rows behind it will be written again."""
-    for name in LOGS:
-        path = run / name
-        if path.exists():
-            os.truncate(path, sizes.get(name, 0))
+    return os.path.lexists(path) and bool(_read(path).get("complete"))
 
 
 def versions() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""A user's network, filter and Vex target, traced once: they give what training expects of them."""
+"""A user's parts, traced once: they give what training expects of them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from sauna.algorithm.types import Hypers, ScoredStep, StepFilter
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput, one_line
+from sauna.training.check_selection import check_selection, may_become
 
 
 def check_plugins(config: Config, spaces: Spaces) -> None:
@@ -31,6 +32,7 @@ def check_plugins(config: Config, spaces: Spaces) -> None:
         if program.filter is not None:
             _check_filter(config, spaces, program.filter)
         _check_target(config)
+        check_selection(config, spaces)
     except BadInput:
         raise
     except Exception as error:  # a user's part fails in its own way
@@ -136,7 +138,7 @@ def _check_filter(config: Config, spaces: Spaces, filter: StepFilter) -> None:
             f"and bool"
         )
     (old, structure), (new, other) = _flat(before), _flat(after)
-    if structure != other or not all(map(_may_become, old, new)):
+    if structure != other or not all(map(may_become, old, new)):
         raise BadInput(f"filter: {config.filter} gives a state of other arrays than it began with")
 
 
@@ -146,8 +148,3 @@ def _flat(tree: Any) -> tuple[list[Any], Any]:
 
 def _shape(x: Any) -> Any:
     return getattr(x, "shape", type(x).__name__)
-
-
-def _may_become(before: Any, after: Any) -> bool:
-    """Returns whether a loop may carry both; a Python number takes the type of its use."""
-    return before.shape == after.shape and (before.dtype == after.dtype or before.weak_type)

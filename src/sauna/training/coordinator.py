@@ -8,7 +8,6 @@ are shared over processes.
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Mapping
 from functools import partial
@@ -22,10 +21,14 @@ from sauna.config.checks import local_parts
 from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.logs import Logs, check_logs
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
+from sauna.system.safe_write import replace_file
 from sauna.system.signals import handled
+from sauna.system.tracebacks import cause_of
 from sauna.system.watchdog import Watchdog
 from sauna.training.display import Display
+from sauna.training.empty_updates import EmptyUpdates
 from sauna.training.run import Run, resume_command
 from sauna.training.tensorboard import TensorBoard
 from sauna.training.worker import serve, write_job
@@ -52,11 +55,13 @@ class Coordinator:
         self._states: list[dict[int, dict[str, np.ndarray]]] = [{} for _ in self._parts]
         self._reached = [self._iteration] * len(self._parts)
         self._ended: list[int | None] = [None] * len(self._parts)
-        self._due: list[tuple[int, dict[str, int]]] = []  # checkpoints waiting for their states
+        self._logs = Logs(run.path)
+        self._due: list[tuple[int, dict[str, Any]]] = []  # checkpoints waiting for their states
         self._lead, self._granted = LEAD, 0
         self._signal: int | None = None
         self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
+        self._empty_updates = EmptyUpdates()
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
@@ -115,7 +120,7 @@ class Coordinator:
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None
-            self._save(self._last_iteration(), run_directory.log_sizes(self._run.path))
+            self._save(self._last_iteration(), self._logs.counted())
             self._write_summary(complete)
         if not complete:
             raise Interrupted(
@@ -207,8 +212,7 @@ class Coordinator:
                 self._states[number][header["iteration"]] = message.arrays
                 self._flush()
             case "failure":
-                error = BadInput if header.get("bad_input") else SaunaError
-                raise error(header["message"])
+                raise _failure(self._run.path, header)
             case "done":
                 self._ended[number] = self._reached[number]
                 self._grant()
@@ -222,7 +226,7 @@ class Coordinator:
             self._write_rows(rows, [m.header["timing"] for m in messages.values()])
             self._iteration += 1
             if self._iteration % self._run.config.checkpoint_every == 0:
-                self._due.append((self._iteration, run_directory.log_sizes(self._run.path)))
+                self._due.append((self._iteration, self._logs.counted()))
         while self._due and self._all_states_of(self._due[0][0]):
             self._save(*self._due.pop(0))
 
@@ -239,7 +243,7 @@ class Coordinator:
             for states, end in zip(self._states, self._ended, strict=True)
         )
 
-    def _save(self, iteration: int, logs: dict[str, int]) -> None:
+    def _save(self, iteration: int, logs: dict[str, Any]) -> None:
         """Saves all members at (the start of) an iteration, or at their end before it."""
         arrays: dict[str, np.ndarray] = {}
         for states in self._states:
@@ -250,7 +254,7 @@ class Coordinator:
             self._run.path / "checkpoints",
             iteration,
             arrays,
-            {**self._run.manifest(), "logs": logs},
+            {**self._run.manifest(), **logs},
             self._run.config.keep_checkpoints,
         )
 
@@ -271,11 +275,14 @@ class Coordinator:
                 for t in timings
                 for member, seconds in t["update_cpu_seconds"].items()
             }
-        _append(self._run.path / "metrics.jsonl", rows)
-        _append(self._run.path / "timing.jsonl", [timing])
+        for warning in self._empty_updates.see(rows):
+            self._display.say(warning)
+        self._logs.append("metrics.jsonl", rows)
+        self._logs.append("timing.jsonl", [timing])
         self._tensorboard.write(rows, timing)
 
     def _write_summary(self, complete: bool) -> None:
+        check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
         last: dict[str, dict[str, Any]] = {}
         for row in run_directory.rows(self._run.path):
             last[row["member"]] = row
@@ -305,13 +312,21 @@ def lead_for(seconds: float) -> int:
     return int(min(max(SECONDS_AHEAD / max(seconds, 1e-6), LEAD), MAX_LEAD))
 
 
+def _failure(run: Path, header: dict[str, Any]) -> SaunaError:
+    """The error of a worker's last message; its whole traceback is kept in `failure.txt`."""
+    cause = cause_of(header)
+    if header.get("bad_input"):
+        error: SaunaError = BadInput(header["message"])
+    else:
+        replace_file(run / "failure.txt", header.get("traceback", header["message"]).encode())
+        where = f" (the whole traceback: {run / 'failure.txt'})" if header.get("frames") else ""
+        error = SaunaError(header["message"] + where)
+    error.__cause__ = cause
+    return error
+
+
 def _environment(config: Config) -> dict[str, str]:
     """Lists what a worker's JAX has to know before it is imported."""
     if config.backend == "device" and config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
     return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
-
-
-def _append(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("a") as file:
-        file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)

@@ -173,12 +173,15 @@ def _together(config: Config) -> bool:
 
 
 def check_own_parts(prepared: Prepared) -> None:
-    """Looks at what of a run is the user's own: a mistake there is bad input.
+    """Looks at what of a run is the user's own, and at rules' arguments: a mistake is bad input.
 
     Raises:
       BadInput: a part cannot be used.
     """
-    if own_parts(prepared.config):
+    config = prepared.config
+    numbers = (config.sampler_kwargs, config.loss_weight_kwargs, config.stop_kwargs)
+    rules = any(text != "{}" for text in numbers) or config.control == "stride"
+    if own_parts(config) or rules:
         configure_jax()
         from sauna.training.check_plugins import check_plugins
 

@@ -12,15 +12,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.config.checks import check_consistent, local_parts
+from sauna.config.checks import cautions, check_consistent, local_parts
+from sauna.config.code import changed_code, code_of
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
 from sauna.config.stored import read_stored, to_stored
-from sauna.envs.spaces import Spaces, same_spaces
+from sauna.config.trust import check_trusted, seal
+from sauna.envs.spaces import Spaces, difference, read_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
+from sauna.system.working_folder import kept_folder
 from sauna.training.display import Display
 from sauna.training.loop.multihost import Follower, join, read_host_rank
 from sauna.training.prepare import (
@@ -48,6 +51,7 @@ class Run:
         self, path: Path, prepared: Prepared, drop_rates: list[list[float]], made: bool = False
     ) -> None:
         self.path, self.prepared, self.drop_rates, self.made = path, prepared, drop_rates, made
+        self.code = code_of(to_stored(prepared.run))
         self.lock: IO[str] = run_directory.lock(path)
 
     @property
@@ -77,6 +81,7 @@ class Run:
             "spaces": list(self.spaces),
             "members": [member.name for member in self.members],
             "versions": run_directory.versions(),
+            "code": self.code,
         }
 
 
@@ -86,15 +91,17 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
     """
-    overrides = plain(overrides)
-    placed = place(resolve_run(overrides))
-    check_writes(placed.config)
-    prepared = examine(placed, overrides)
-    drop_rates = drop_rates_of(prepared.members)
-    TensorBoard.check(prepared.config)
-    check_own_parts(prepared)
+    with kept_folder():  # an environment may go elsewhere
+        overrides = plain(overrides)
+        placed = place(resolve_run(overrides))
+        check_writes(placed.config)
+        prepared = examine(placed, overrides)
+        drop_rates = drop_rates_of(prepared.members)
+        TensorBoard.check(prepared.config)
+        check_own_parts(prepared)
     path, made = _make_directory(prepared.config)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
+    path = Path.cwd() / path
     stored = {
         **to_stored(prepared.run),
         "spaces": list(prepared.spaces),
@@ -104,11 +111,12 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         "git": run_directory.git_revision(),
         "machine": run_directory.machine(),
     }
+    stored["seal"] = seal(stored)
     with disk_errors(path):
         run = Run(path, prepared, drop_rates, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
-            run_directory.write_json(path / "config.json", stored)
+            run_directory.write_config(path, {**stored, "code": run.code})
         except BaseException:
             run.lock.close()
             raise
@@ -136,6 +144,8 @@ def _show_notes(prepared: Prepared, display: Display) -> None:
     config = prepared.config
     if note := many_seeds(config.seeds):
         display.say(note)
+    for caution in cautions(config):
+        display.say(caution)
     if prepared.differs:
         display.say(
             f"warning: {config.env} does not repeat itself ({prepared.differs}): this run can be "
@@ -175,13 +185,27 @@ def follow(overrides: Mapping[str, Any], display: Display) -> None:
     train_members(job, Follower(display.say))
 
 
-def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
-    """Opens an existing run, to be continued.
+@kept_folder()
+def reopen(
+    path: Path,
+    changes: Mapping[str, Any],
+    display: Display,
+    trust: bool = False,
+    accept_changed_code: bool = False,
+) -> Run:
+    """Opens an existing run, to be continued; from then on it counts as this user's.
+
+    Args:
+      trust: the code that it names may run, even if another user named it.
+      accept_changed_code: go on with that code even if it is not what it was.
 
     Raises:
-      BadInput: it is not a run, is in use, or `changes` would change what is computed.
+      BadInput: it is not a run, is in use, names code of somebody else's, or `changes` would change
+        what is computed.
     """
+    path = Path.cwd() / path  # an environment may go elsewhere
     stored = run_directory.read_config(path)
+    check_trusted(stored, str(path), stored.get("seal"), trust)
     resumable = fields_with("resumable")
     for name in changes:
         if name not in resumable:
@@ -195,13 +219,36 @@ def reopen(path: Path, changes: Mapping[str, Any], display: Display) -> Run:
     if (changed.config.backend == "device") != (before.config.backend == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
     prepared = examine(changed, changes)
-    if not same_spaces(stored.get("spaces"), prepared.spaces):
+    _check_spaces(prepared, path, stored["spaces"])
+    with disk_errors(path):
+        run = Run(path, prepared, stored.get("drop_rates", []))
+    differs = changed_code(stored.get("code", run.code), run.code)
+    if differs and not accept_changed_code:
+        run.lock.close()
         raise BadInput(
-            f"{prepared.config.env} has other spaces than when the run started: "
-            f"{prepared.spaces} instead of {stored.get('spaces')}"
+            f"{path} was trained with other code: {differs}; --accept-changed-code (in Python "
+            f"accept_changed_code=True) goes on with today's"
         )
     with disk_errors(path):
-        return Run(path, prepared, stored.get("drop_rates", []))
+        if trust or differs:
+            stored = run_directory.with_code(stored, run.code) if differs else stored
+            run_directory.write_config(path, {**stored, "seal": seal(stored)})
+    return run
+
+
+def _check_spaces(prepared: Prepared, path: Path, stored: list[Any]) -> None:
+    """Refuses an environment whose spaces a learner sees as other than the stored ones.
+
+    Raises:
+      BadInput: naming the part that differs.
+    """
+    try:
+        differs = difference(prepared.spaces, read_spaces(stored))
+    except (TypeError, ValueError) as error:
+        raise BadInput(f"config: {path}: its spaces cannot be read: {error}") from error
+    if differs:
+        env = prepared.config.env
+        raise BadInput(f"{env} has other spaces than when the run started: {differs}")
 
 
 def resume_command(path: Path) -> str:

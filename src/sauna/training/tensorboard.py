@@ -8,6 +8,7 @@ from typing import Any
 
 from sauna.config.settings import Config
 from sauna.system.errors import BadInput
+from sauna.system.safe_write import own_folder
 
 
 class TensorBoard:
@@ -44,7 +45,8 @@ class TensorBoard:
         assert self._folder is not None
         name = row["member"]
         if name not in self._writers:
-            folder = self._folder / name
+            for folder in (self._folder, self._folder / row["arm"], self._folder / name):
+                own_folder(folder)
             self._writers[name] = SummaryWriter(str(folder), purge_step=row["env_steps"])
         return self._writers[name]
 

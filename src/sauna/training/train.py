@@ -8,9 +8,10 @@ from typing import Any
 
 from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, fields_with, to_json
-from sauna.envs.spaces import read_spaces, same_spaces
+from sauna.envs.spaces import difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
+from sauna.system.logs import check_logs, cut_logs, damage_of
 from sauna.training.coordinator import Coordinator
 from sauna.training.display import Display
 from sauna.training.run import Run, disk_errors
@@ -43,14 +44,22 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
 def _train(run: Run, display: Display, resume: bool, inexact: bool) -> bool:
     loaded = None
     if resume:
-        if run_directory.is_complete(run.path):
+        if run_directory.is_complete(run.path) and _is_whole(run, display):
             display.say(f"{run.path} is complete; nothing to do")
             return False
         loaded = _load(run, display)
-        run_directory.cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
+        cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
     with Coordinator(run, display, loaded, inexact) as coordinator:
         coordinator.run()
     return True
+
+
+def _is_whole(run: Run, display: Display) -> bool:
+    """Whether the rows of a complete run are those that were written; what is not is named."""
+    damage = damage_of(run.path)
+    if damage is not None:
+        display.say(f"warning: {damage}; the run is continued from before that")
+    return damage is None
 
 
 def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
@@ -64,7 +73,7 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
 
     def check(manifest: dict[str, Any]) -> None:
         _check_same(run.path, ours, manifest)
-        run_directory.check_logs(run.path, manifest["logs"])
+        check_logs(run.path, manifest)
 
     loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
     before = loaded.manifest.get("versions", {}) if loaded else {}
@@ -94,8 +103,12 @@ def _check_same(path: Path, ours: dict[str, Any], manifest: dict[str, Any]) -> N
         for name, value in ours["config"].items()
         if name not in free and stored[name] != value
     ]
-    if not same_spaces(manifest["spaces"], read_spaces(ours["spaces"])):
-        differing.append("spaces differ")
+    try:
+        spaces = difference(read_spaces(manifest["spaces"]), read_spaces(ours["spaces"]))
+    except (TypeError, ValueError):
+        spaces = "cannot be read"
+    if spaces:
+        differing.append(f"spaces differ: {spaces}")
     for name in ("arms", "members"):
         if manifest[name] != json.loads(json.dumps(ours[name])):
             differing.append(f"{name} differ")

@@ -6,7 +6,6 @@ import os
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
@@ -16,9 +15,10 @@ import numpy as np
 from sauna.config.presets import RunConfig
 from sauna.config.stored import read_stored, to_stored
 from sauna.envs.spaces import Spaces, read_spaces
-from sauna.system.errors import BadInput, SaunaError
+from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.jax_setup import configure_jax
 from sauna.system.processes import Shared, child_ends, receive, send
+from sauna.system.tracebacks import describe_failure
 from sauna.training.prepare import Prepared
 
 if TYPE_CHECKING:
@@ -97,10 +97,12 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     except (EOFError, BrokenPipeError):
         return
     except SaunaError as error:
+        header = {"kind": "failure", "message": str(error)}
         bad = isinstance(error, BadInput)
-        send(outbox, {"kind": "failure", "message": str(error), "bad_input": bad})
-    except Exception:
-        send(outbox, {"kind": "failure", "message": traceback.format_exc()})
+        send(outbox, {**header, "bad_input": bad, **describe_failure(error, not dies_alone)})
+    except Exception as error:
+        header = {"kind": "failure", "message": f"training raised {one_line(error)}"}
+        send(outbox, {**header, **describe_failure(error, not dies_alone)})
 
 
 def train_members(job: Job, reporter: Reporter) -> None:

@@ -82,7 +82,7 @@ def test_value_clipping_can_be_turned_off() -> None:
 @pytest.mark.parametrize("trunk", ["separate", "shared"])
 @pytest.mark.parametrize("target", ["sample", "minibatch"])
 def test_gradients_equal_finite_differences(trunk: str, target: str) -> None:
-    config = configured(hidden="5,4", trunk=trunk, vex_target=target)
+    config = configured(arm="vex-head", hidden="5,4", trunk=trunk, vex_target=target)
     with jax.enable_x64(True):
         policy = make_policy(config, VECTOR)
         params = policy.init(jax.random.key(0)).astype(jnp.float64)

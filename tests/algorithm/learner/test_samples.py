@@ -141,8 +141,8 @@ def test_a_ratio_that_reaches_the_threshold_exactly_is_kept() -> None:
 @pytest.mark.parametrize(
     "filter", [sauna_per_env("all", 12), sauna_per_env("kept", 12), random_drop()]
 )
-def test_stretches_decide_as_one_long_stretch_does(filter) -> None:
-    """Padding behind a stretch is not looked at, and a step's key is that of its place."""
+def test_stretches_decide_as_one_long_segment_does(filter) -> None:
+    """Padding behind a segment is not looked at, and a step's key is that of its place."""
     vex = jnp.asarray(np.random.default_rng(0).normal(size=(12, 2)), jnp.float32)
     observation, key = jnp.zeros((12, 2, 3)), jax.random.key(1)
     given = scalars(threshold=0.8, drop_rate=0.5)

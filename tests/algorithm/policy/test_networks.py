@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,16 +23,6 @@ from sauna.training.loop.member_state import flat_params, named_params
 
 VECTOR = Spaces("vector", (11,), "continuous", (3,), "", "")
 IMAGE = Spaces("image", (40, 40, 2), "discrete", (3,), "", "")
-
-
-class Sine(nn.Module):
-    """A user's own trunk."""
-
-    width: int = 7
-
-    @nn.compact
-    def __call__(self, observation):
-        return jnp.sin(nn.Dense(self.width, name="inner")(observation))
 
 
 def tree(spaces: Spaces = VECTOR, **settings):
@@ -210,7 +199,7 @@ def test_named_parameters_go_round() -> None:
 
 @pytest.mark.parametrize("trunk", ["separate", "shared"])
 def test_a_users_own_module_trains(trunk: str) -> None:
-    job = make_job("worlds:Scripted", network="test_networks:Sine", trunk=trunk)
+    job = make_job("worlds:Scripted", network="trunks:Sine", trunk=trunk)
     final = train_here(job).final
     part = "trunk" if trunk == "shared" else "policy_trunk"
     assert final[f"sauna/0/params/{part}/inner/kernel"].shape == (3, 7)

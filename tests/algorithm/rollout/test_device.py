@@ -261,7 +261,7 @@ def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
     "settings, message",
     [
         ({"env": "jax_worlds:no_env", "backend": "device"}, "not a sauna.JaxEnv"),
-        ({"env": "InvertedPendulum-v5", "backend": "device"}, "no face on the device"),
+        ({"env": "InvertedPendulum-v5", "backend": "device"}, "does not run on the device"),
         ({"env": "jax_worlds:walk", "env_processes": 1}, "env_processes: not read"),
         ({"env": "InvertedPendulum-v5", "reset": "cached"}, "reset: only read"),
         ({"env": "gymnax/CartPol-v1"}, "CartPole-v1"),

@@ -223,7 +223,7 @@ def sample_dropout_keep(log_prob: Array, log_prob0: Array, deviation: float) -> 
 
 
 def segment_scores(advantage: Array, length: int = 64) -> Array:
-    """Sums A over stretches of `length` steps of one env: `[T, N]` -> `[ceil(T / length), N]`.
+    """Sums A over segments of `length` steps of one env: `[T, N]` -> `[ceil(T / length), N]`.
 
     What is left at the end of the rollout is a shorter segment.
     """

@@ -1,4 +1,4 @@
-"""Filters against plain Python with `statistics.median`, and the stretch-wise decision."""
+"""Filters against plain Python with `statistics.median`, and the segment-wise decision."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sauna.algorithm.selection.vex_filter import (
     sauna_at_rate,
     sauna_joint,
     sauna_per_env,
-    threshold_held,
+    threshold_for_rate,
 )
 from sauna.algorithm.types import StepFilter
 from sauna.system.errors import BadInput
@@ -124,8 +124,8 @@ def test_random_drop_drops_at_its_rate_whatever_the_head_says() -> None:
 
 
 @pytest.mark.parametrize("name", ["sauna", "random-drop"])
-def test_deciding_in_stretches_is_deciding_step_by_step(name: str) -> None:
-    """Whatever the stretches, whatever lies behind their length."""
+def test_deciding_in_segments_is_deciding_step_by_step(name: str) -> None:
+    """Whatever the segments, whatever lies behind their length."""
     settings = {"drop_rate": 0.3} if name == "random-drop" else {"threshold": 0.8}
     config = configured(arm="random-drop" if name == "random-drop" else "sauna", **settings)
     filter = make_filter(config)
@@ -218,7 +218,7 @@ def test_the_threshold_that_is_told_would_keep_the_rate() -> None:
     vex = np.random.default_rng(5).normal(0.5, 0.3, (200, 2)).astype(np.float32)
     valid = np.ones(vex.shape, bool)
     valid[150:, 1] = False
-    told = float(threshold_held(jnp.asarray(vex), jnp.asarray(valid), 0.6))
+    told = float(threshold_for_rate(jnp.asarray(vex), jnp.asarray(valid), 0.6))
     ratio = np.abs(vex[valid]) / abs(np.median(vex[valid]))
     assert abs((ratio >= told).mean() - 0.6) < 0.01
 

@@ -84,7 +84,7 @@ def test_an_episode_without_an_end_is_cut_and_that_is_said(endless: Path, capsys
     assert said == ["ppo/0: 2 of 2 episodes were cut after 40 steps"]
     cli.main(["eval", str(endless), "--episodes", "1", "--max-steps", "7"])
     assert "length 7.0" in capsys.readouterr().out
-    page = sauna.inspect(endless, episodes=2, max_steps=30, pictures=False)
+    page = sauna.inspect(endless, episodes=2, max_steps=30, frames=False)
     assert page.stat().st_size > 10_000
 
 

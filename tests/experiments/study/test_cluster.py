@@ -189,7 +189,7 @@ def test_a_log_that_was_cut_back_is_replaced_as_a_whole(tmp_path) -> None:
 
 
 def test_a_checkpoint_never_counts_on_more_than_has_arrived(tmp_path, monkeypatch) -> None:
-    """Interrupted anywhere while arriving, the newest checkpoint has its logs and both files."""
+    """Interrupted any_member while arriving, the newest checkpoint has its logs and both files."""
     here, there = tmp_path / "here", tmp_path / "there"
     tracker = ray_files.Tracker(there)
     put(there, {"run/metrics.jsonl": "1\n2\n", "run/summary.json": "{}", "run/config.json": "{}"})
@@ -206,7 +206,7 @@ def test_a_checkpoint_never_counts_on_more_than_has_arrived(tmp_path, monkeypatc
         left[0] -= 1
         path.write_bytes(data)
 
-    monkeypatch.setattr(ray_files.run_directory, "write_durably", failing)
+    monkeypatch.setattr(ray_files.safe_write, "write_durably", failing)
     for writes in range(5):
         shutil.rmtree(here, ignore_errors=True)
         left[0] = writes

@@ -7,21 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.losses import Losses, standardize, weighted_mean
+from sauna.algorithm.learner.losses import Losses, weighted_mean
 from sauna.algorithm.learner.metrics import (
     UpdateMetrics,
     Work,
     head_statistics,
     variance_explained,
 )
-from sauna.algorithm.learner.selected import (
-    Totals,
-    drawn_length,
-    needs_selection,
-    update_on_selected,
-)
-from sauna.algorithm.learner.update import Parts, update_on_all, vex_targets
-from sauna.algorithm.selection.draws import minibatch_size
+from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
+from sauna.algorithm.learner.update import Parts, loss_advantage, update_on_all, vex_targets
 from sauna.algorithm.selection.vex_filter import moved_threshold
 from sauna.algorithm.types import Array, Batch, Hypers, Rollout, TrainState
 
@@ -51,9 +45,9 @@ def learn(
         sound = jnp.isfinite(totals.losses.total)
     else:
         learned_from = batch
-        if config.normalize_advantages and config.normalize_over != "minibatch":
-            standardized = standardize(batch.advantage, batch.weight)
-            learned_from = batch._replace(advantage=standardized)
+        if config.normalize_over != "minibatch":
+            over_all = loss_advantage(batch.advantage, batch.weight, config)
+            learned_from = batch._replace(advantage=over_all)
         state, losses, gradient_norm = update_on_all(
             state, learned_from, hypers, order, parts=parts
         )
@@ -84,8 +78,6 @@ def _means(
     config, sampler = parts.config, parts.rules.sampler
     steps = totals.steps.astype(jnp.float32)
     rows = config.rollout_steps * config.envs
-    full = rows // config.minibatches
-    size = minibatch_size(config.selection_mode, full, config.minibatches, drawn_length(parts))
     epochs = totals.epochs.astype(jnp.float32)
     looks: Any = 0.0
     if sampler is not None and sampler.reads_policy:
@@ -96,8 +88,8 @@ def _means(
     work = Work(
         gradient_steps=steps,
         sample_rate=totals.drawn / (epochs * present),
-        samples_forward=steps * size + looks,
-        samples_backward=steps * size,
+        samples_forward=totals.rows + looks,
+        samples_backward=totals.rows.astype(jnp.float32),
         effective_sample_size=totals.effective_size / steps,
     )
     losses = jax.tree.map(lambda x: x / steps, totals.losses)

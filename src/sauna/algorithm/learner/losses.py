@@ -91,6 +91,9 @@ def weigh_policy(
 ) -> tuple[Array, Array, Any, Any]:
     """What a loss weight makes of a minibatch's policy terms; as they are if there is no rule.
 
+    Args:
+      log_ratio: `[B]` what the objective is a function of; for A2C the log-probability.
+
     Returns:
       `log_ratio`, with the gradient of the mean scaled if the rule weighs that alone; the mask and
       the scale (None: 1) of the terms `[B]`; the effective size of the weights, if there are any.
@@ -98,9 +101,10 @@ def weigh_policy(
     if rules.loss_weight is None:
         return log_ratio, minibatch.policy_mask, minibatch.policy_scale, None
     rows = minibatch.rows
+    change = jnp.where(rows.weight > 0, log_prob - rows.log_prob, 0.0)
     terms = LossTerms(
         jax.lax.stop_gradient(log_prob),
-        jax.lax.stop_gradient(log_ratio),
+        jax.lax.stop_gradient(change),
         minibatch.advantage,
         jax.lax.stop_gradient(entropy),
         minibatch.policy_mask,

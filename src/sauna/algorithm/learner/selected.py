@@ -18,6 +18,7 @@ from sauna.algorithm.learner.samples import recomputed
 from sauna.algorithm.learner.update import (
     Parts,
     gradient_step,
+    loss_advantage,
     minibatch_advantage,
     vex_targets,
 )
@@ -50,6 +51,7 @@ class Totals(NamedTuple):
     effective_size: Array
     drawn: Array  # [] rows of the policy loss, over epochs
     epochs: Array  # [] int32 begun
+    rows: Array  # [] int32 through the gradient
     stopped: Array  # [] bool
 
 
@@ -80,21 +82,26 @@ def update_on_selected(
     sampler = parts.rules.sampler
     choice = None
     if sampler is None or not sampler.each_epoch:
-        state, choice = choose(state, batch, key, parts=parts)
+        state, choice = choose(state, batch, jax.random.fold_in(key, 0), parts=parts)
 
-    def epoch(e: Array, carry: tuple[TrainState, Totals]) -> tuple[TrainState, Totals]:
-        state, totals = carry
+    def goes_on(carry: tuple[Array, TrainState, Totals]) -> Array:
+        return (carry[0] < parts.config.epochs) & ~carry[2].stopped
+
+    def epoch(carry: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
+        e, state, totals = carry
         now, chosen = batch, choice
         epoch_key = jax.random.fold_in(key, e + 1)
         if parts.config.recompute_advantages:
             value = parts.policy.apply(state.params, rollout.observation).value
             now = recomputed(batch, rollout, value, hypers, config=parts.config)
         if chosen is None:
-            state, chosen = choose(state, now, epoch_key, parts=parts)
-        return _epoch(state, totals, now, chosen, hypers, order[e], epoch_key, parts=parts)
+            state, chosen = choose(state, now, jax.random.fold_in(epoch_key, 2), parts=parts)
+        state, totals = _epoch(state, totals, now, chosen, hypers, order[e], epoch_key, parts=parts)
+        return e + 1, state, totals
 
-    start = (state, _no_totals())
-    return jax.lax.fori_loop(0, parts.config.epochs, epoch, start)
+    start = (jnp.int32(0), state, _no_totals())
+    _, state, totals = jax.lax.while_loop(goes_on, epoch, start)
+    return state, totals
 
 
 def choose(
@@ -167,16 +174,13 @@ def _epoch(
     mode, full = config.selection_mode, len(order) // config.minibatches
     size = minibatch_size(mode, full, config.minibatches, drawn_length(parts))
     steps = minibatch_count(mode, drawn.number, full, config.minibatches)
-    begun = ~totals.stopped & (steps > 0)
     kept = drawn.number
     if choice.probability is None:
         kept = jnp.sum(choice.keep, dtype=jnp.int32)
-    totals = totals._replace(
-        drawn=totals.drawn + jnp.where(begun, kept, 0), epochs=totals.epochs + begun
-    )
+    totals = totals._replace(drawn=totals.drawn + kept, epochs=totals.epochs + 1)
     batch = _standardized(batch, choice, config)
 
-    def goes_on(now: tuple[Array, TrainState, Totals]) -> Array:
+    def continues(now: tuple[Array, TrainState, Totals]) -> Array:
         return (now[0] < steps) & ~now[2].stopped
 
     def step(now: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
@@ -186,18 +190,18 @@ def _epoch(
         after, losses, norm = gradient_step(state, part, hypers, parts=parts)
         return i + 1, *_counted(totals, state, after, losses, norm, part)
 
-    _, state, totals = jax.lax.while_loop(goes_on, step, (jnp.int32(0), state, totals))
+    _, state, totals = jax.lax.while_loop(continues, step, (jnp.int32(0), state, totals))
     return state, totals
 
 
 def _standardized(batch: Batch, choice: Choice, config: Config) -> Batch:
     """Advantages as the loss uses them, if they are standardised over more than a minibatch."""
-    if not config.normalize_advantages or config.normalize_over == "minibatch":
+    if config.normalize_over == "minibatch":
         return batch
     over = batch.weight
     if config.normalize_over == "kept" and choice.keep is not None:
         over = over * choice.keep
-    return batch._replace(advantage=standardize(batch.advantage, over))
+    return batch._replace(advantage=loss_advantage(batch.advantage, over, config))
 
 
 def minibatch(
@@ -210,14 +214,16 @@ def minibatch(
     """
     index, value_index = drawn.rows[places], drawn.value_rows[places]
     rows = _rows(batch, index, counts)
+    for_all = parts.config.selection_losses == "all"
     separate = choice.value_probability is not None or (
-        choice.probability is not None and parts.config.selection_losses == "policy"
+        choice.probability is not None and not for_all
     )
     value_rows = _rows(batch, value_index, counts) if separate else rows
     mask = rows.weight
-    if choice.keep is not None and parts.config.selection_losses == "policy":
+    if choice.keep is not None and not for_all:
         mask = mask * choice.keep[index]
     advantage = minibatch_advantage(rows._replace(weight=mask), parts.config)
+    value_weight = choice.value_weight if for_all else None
     return Minibatch(
         rows=rows,
         value_rows=value_rows,
@@ -226,7 +232,7 @@ def minibatch(
         policy_mask=mask,
         policy_scale=None if choice.weight is None else choice.weight[index],
         value_mask=value_rows.weight,
-        value_scale=None if choice.value_weight is None else choice.value_weight[value_index],
+        value_scale=None if value_weight is None else value_weight[value_index],
     )
 
 
@@ -259,15 +265,18 @@ def _counted(
         totals.effective_size + effective,
         totals.drawn,
         totals.epochs,
+        totals.rows,
         totals.stopped,
     )
     chosen: Any = jax.tree.map(
         lambda new, old: jnp.where(stop, old, new), (after, more), (before, totals)
     )
-    return chosen[0], chosen[1]._replace(stopped=totals.stopped | stop)
+    computed = len(part.advantage) * (1 if part.value_rows is part.rows else 2)
+    return chosen[0], chosen[1]._replace(rows=totals.rows + computed, stopped=totals.stopped | stop)
 
 
 def _no_totals() -> Totals:
     zero = jnp.float32(0.0)
     losses = Losses(zero, zero, zero, zero, zero, zero, zero)
-    return Totals(losses, zero, jnp.int32(0), zero, jnp.int32(0), jnp.int32(0), jnp.bool_(False))
+    none = jnp.int32(0)
+    return Totals(losses, zero, none, zero, none, none, none, jnp.bool_(False))

@@ -69,15 +69,19 @@ def plain_minibatch(rows: Batch, parts: Parts) -> Minibatch:
 
 
 def minibatch_advantage(rows: Batch, config: Config) -> Array:
-    """The advantages `[B]` as the loss uses them.
-
-    They are standardised here unless that was done over a larger set before.
-    """
-    if config.advantage_sign == "positive":
-        return cut_at_zero(rows.advantage, rows.weight)
-    if config.normalize_advantages and config.normalize_over == "minibatch":
-        return standardize(rows.advantage, rows.weight)
+    """The advantages `[B]` as the loss uses them, unless a larger set has made them so before."""
+    if config.normalize_over == "minibatch":
+        return loss_advantage(rows.advantage, rows.weight, config)
     return rows.advantage
+
+
+def loss_advantage(advantage: Array, weight: Array, config: Config) -> Array:
+    """The advantages as the loss uses them: standardised, cut at zero, or as they are."""
+    if config.advantage_sign == "positive":
+        return cut_at_zero(advantage, weight)
+    if config.normalize_advantages:
+        return standardize(advantage, weight)
+    return advantage
 
 
 def minibatch_losses(

@@ -73,19 +73,19 @@ def minibatch_target(return_: Array, value: Array, weight: Array, episode: Array
 
 
 def episode_target(return_: Array, value: Array, weight: Array, episode: Array) -> Array:
-    """Eq. 5 over each stretch of one episode inside a column of `[T, N]`."""
+    """Eq. 5 over each segment of one episode inside a column of `[T, N]`."""
 
     def column(return_: Array, value: Array, weight: Array, episode: Array) -> Array:
         length = return_.shape[0]
 
-        def over_stretch(x: Array) -> Array:
+        def over_segment(x: Array) -> Array:
             total = jax.ops.segment_sum(x * weight, episode, length)
             number = jax.ops.segment_sum(weight, episode, length)
             return (total / jnp.maximum(number, 1.0))[episode]
 
-        variance = over_stretch((return_ - over_stretch(return_)) ** 2)
-        unexplained = over_stretch((return_ - value) ** 2)
-        return _explained(unexplained, variance, over_stretch(return_**2))
+        variance = over_segment((return_ - over_segment(return_)) ** 2)
+        unexplained = over_segment((return_ - value) ** 2)
+        return _explained(unexplained, variance, over_segment(return_**2))
 
     return jax.vmap(column, in_axes=1, out_axes=1)(return_, value, weight, episode)
 

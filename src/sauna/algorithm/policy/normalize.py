@@ -1,7 +1,8 @@
 """Running moments of observations and returns, as in baselines' `VecNormalize`.
 
 The functions work on numpy and JAX arrays alike, and on any number of leading axes (a population
-on the host is one array); on the host the moments are float64, which 10^6 additions need.
+on the host is one array). Long sums need more than float32: on the host the moments are float64,
+on the device each is a float32 and what rounding has lost of it.
 """
 
 from __future__ import annotations
@@ -52,6 +53,62 @@ def update_moments(moments: Moments, batch: Any, active: Any) -> Moments:
     return Moments(moments.mean + move, variance + batch_variance * fraction, total)
 
 
+class LongMoments(NamedTuple):
+    """Moments in float32 that stay right over 10^10 samples.
+
+    A float32 count stops at 2^24, and a variance that is scaled by `n / (n + 1)` stops decaying
+    before that. Here each moment only has a small increment added, and `*_lost` holds what the
+    rounding of all additions so far has left out (Kahan 1965).
+    """
+
+    mean: Any
+    variance: Any
+    count: Any
+    mean_lost: Any
+    variance_lost: Any
+    count_lost: Any
+
+    @property
+    def moments(self) -> Moments:
+        """The moments to normalise with, to float32's precision."""
+        return Moments(self.mean, self.variance, self.count)
+
+
+def long_moments(moments: Moments) -> LongMoments:
+    """The same, with nothing lost so far."""
+    return LongMoments(*moments, *(0.0 * part for part in moments))
+
+
+def _add(moments: LongMoments, mean: Any, variance: Any, count: Any) -> LongMoments:
+    """Moments after adding an increment to each."""
+    sums, lost = [], []
+    for total, before, increment in zip(
+        moments[:3], moments[3:], (mean, variance, count), strict=True
+    ):
+        more = before + increment
+        after = total + more
+        sums.append(after)
+        lost.append(more - (after - total))
+    return LongMoments(*sums, *lost)
+
+
+def update_long_moments(moments: LongMoments, batch: Any, active: Any) -> LongMoments:
+    """`update_moments`, by increments: with `f = n_b / (n_a + n_b)` and `d = mean_b - mean_a`,
+
+    `mean += f d` and `var += f (var_b - var_a + (1 - f) d^2)`.
+    """
+    weight = active[..., None]
+    number = weight.sum(-2)
+    divisor = number + (number == 0)
+    batch_mean = (batch * weight).sum(-2) / divisor
+    deviation = (batch - batch_mean[..., None, :]) * weight
+    batch_variance = (deviation**2).sum(-2) / divisor
+    fraction = number / (moments.count + number)
+    delta = batch_mean - moments.mean
+    spread = batch_variance - moments.variance + (1.0 - fraction) * delta**2
+    return _add(moments, fraction * delta, fraction * spread, 1.0 * number)
+
+
 def normalize(moments: Moments, batch: Any, clip: float) -> Any:
     """`clip((x - mean) / sqrt(var + eps), +-clip)` of `[..., N, D]`."""
     mean, variance = moments.mean[..., None, :], moments.variance[..., None, :]
@@ -71,6 +128,25 @@ def moments_after_each(moments: Moments, values: Any, valid: Any) -> Moments:
     shift = deviation.sum(1).cumsum() / count
     square = moments.count * moments.variance + (deviation**2).sum(1).cumsum()
     return Moments(moments.mean + shift, (square / count - shift**2).clip(0.0), count)
+
+
+def long_moments_after_all(
+    moments: LongMoments, values: Any, valid: Any
+) -> tuple[Moments, LongMoments]:
+    """`moments_after_each`, by increments, and what the next rollout starts from.
+
+    With `k` samples so far: `var += (sum d^2 - k var) / n - (sum d / n)^2`.
+
+    Args:
+      moments: scalars.
+    """
+    deviation = (values - moments.mean) * valid
+    number = valid.sum(1).cumsum()
+    count = moments.count + number
+    shift = deviation.sum(1).cumsum() / count
+    spread = ((deviation**2).sum(1).cumsum() - number * moments.variance) / count - shift**2
+    each = Moments(moments.mean + shift, (moments.variance + spread).clip(0.0), count)
+    return each, _add(moments, shift[-1], spread[-1], 1.0 * number[-1])
 
 
 def scale_rewards(moments: Moments, reward: Any, clip: float) -> Any:

@@ -1,7 +1,7 @@
 """How the members of a process choose actions at each vector step.
 
 Acting needs the policy head alone: log-probabilities, values and Vex are computed afterwards for a
-whole stretch (`Program.score`). For an MLP the few small products are a loop of our own, because a
+whole segment (`Program.score`). For an MLP the few small products are a loop of our own, because a
 call of a JAX program costs more than they do; another network acts by such a call.
 """
 

@@ -17,12 +17,13 @@ import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.policy.normalize import (
-    Moments,
+    LongMoments,
     initial_moments,
-    moments_after_each,
+    long_moments,
+    long_moments_after_all,
     normalize,
     scale_rewards,
-    update_moments,
+    update_long_moments,
 )
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import capacity
@@ -31,6 +32,7 @@ from sauna.algorithm.types import Array, Hypers, Keys, Rollout, ScoredStep, Step
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv, Running, Transition, advance, begin
 
+LARGEST = 1e18  # of an observation or a reward: its square is finite in float32
 WINDOW = 100  # finished episodes of one iteration that are reported one by one, the latest
 
 
@@ -38,8 +40,8 @@ class CollectState(NamedTuple):
     """What one member carries from one rollout to the next."""
 
     envs: Running  # [N, ...]
-    observation_moments: Moments | tuple[()]  # of [D] float32; () where nothing is normalised
-    reward_moments: Moments  # of [1] float32
+    observation_moments: LongMoments | tuple[()]  # of [D]; () where nothing is normalised
+    reward_moments: LongMoments  # of [1]
     discounted_return: Array  # [N] float32
     episode_return: Array  # [N] float32, raw rewards so far
     episode_length: Array  # [N] int32
@@ -73,7 +75,7 @@ class Collecting(NamedTuple):
     env: JaxEnv  # flat
     policy: Policy
     filter: StepFilter | None
-    anywhere: Callable[[Array], Array]  # see `jax_env.advance`
+    any_member: Callable[[Array], Array]  # see `jax_env.advance`
 
 
 class _Row(NamedTuple):
@@ -108,16 +110,15 @@ def start(parts: Collecting, key: Array) -> CollectState:
     envs = begin(parts.env, key, config.envs, cached=config.reset == "cached")
     moments: Any = ()
     if config.normalize_observations:
-        moments = _float32(initial_moments((), envs.observation.shape[-1]))
-        moments = update_moments(moments, envs.observation, jnp.ones(config.envs, bool))
+        moments = _first_moments(envs.observation.shape[-1])
+        moments = update_long_moments(moments, envs.observation, jnp.ones(config.envs, bool))
     zeros = jnp.zeros(config.envs, jnp.float32)
-    return CollectState(
-        envs, moments, _float32(initial_moments((), 1)), zeros, zeros, zeros.astype(jnp.int32)
-    )
+    return CollectState(envs, moments, _first_moments(1), zeros, zeros, zeros.astype(jnp.int32))
 
 
-def _float32(moments: Moments) -> Moments:
-    return Moments(*(jnp.asarray(part, jnp.float32) for part in moments))
+def _first_moments(size: int) -> LongMoments:
+    parts = long_moments(initial_moments((), size))
+    return LongMoments(*(jnp.asarray(part, jnp.float32) for part in parts))
 
 
 def collect(
@@ -136,10 +137,10 @@ def collect(
       limit: env steps that each environment may try, at least T.
     """
     config = parts.config
-    room = capacity(config)
+    max_rows = capacity(config)
     noise = _noise(parts, keys.action, iteration)
     filter_key = jax.random.fold_in(keys.filter, iteration)
-    filter_state = parts.filter.init(config.envs, room) if parts.filter else ()
+    filter_state = parts.filter.init(config.envs, max_rows) if parts.filter else ()
     carry = _Carry(jnp.int32(0), state, filter_state, jnp.zeros(config.envs, jnp.int32))
     begun = _finite_rows(state.envs.observation)  # the run's first ones no step has looked at
 
@@ -148,10 +149,10 @@ def collect(
         key = jax.random.fold_in(filter_key, carry.t)
         return _step(parts, params, carry, noise[carry.t], acting, keys.env, key, hypers)
 
-    if room == config.rollout_steps:  # every env acts in every row: a plain scan
-        carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=room)
+    if max_rows == config.rollout_steps:  # every env acts in every row: a plain scan
+        carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=max_rows)
     else:
-        carry, rows = _until_full(parts, step, carry, room, limit)
+        carry, rows = _until_full(parts, step, carry, max_rows, limit)
     return _finish(parts, params, carry.state, rows, begun, hypers)
 
 
@@ -159,7 +160,7 @@ def _until_full(
     parts: Collecting,
     step: Callable[[_Carry], tuple[_Carry, _Row]],
     carry: _Carry,
-    room: int,
+    max_rows: int,
     limit: Array,
 ) -> tuple[_Carry, _Row]:
     """`step` until all environments are full or `limit` rows are written; the rest stays 0.
@@ -169,17 +170,17 @@ def _until_full(
     """
     wanted = parts.config.rollout_steps
     shapes = jax.eval_shape(step, carry)[1]
-    empty = jax.tree.map(lambda row: jnp.zeros((room, *row.shape), row.dtype), shapes)
+    empty = jax.tree.map(lambda row: jnp.zeros((max_rows, *row.shape), row.dtype), shapes)
 
-    def goes_on(now: tuple[_Carry, _Row]) -> Array:
-        return parts.anywhere(jnp.any(now[0].kept < wanted) & (now[0].t < limit))
+    def continues(now: tuple[_Carry, _Row]) -> Array:
+        return parts.any_member(jnp.any(now[0].kept < wanted) & (now[0].t < limit))
 
     def write(now: tuple[_Carry, _Row]) -> tuple[_Carry, _Row]:
         carry, row = step(now[0])
         at = now[0].t
         return carry, jax.tree.map(lambda rows, x: rows.at[at].set(x), now[1], row)
 
-    return jax.lax.while_loop(goes_on, write, (carry, empty))
+    return jax.lax.while_loop(continues, write, (carry, empty))
 
 
 def _noise(parts: Collecting, key: Array, iteration: Array) -> Array:
@@ -190,10 +191,10 @@ def _noise(parts: Collecting, key: Array, iteration: Array) -> Array:
     return noise.reshape((-1, *noise.shape[2:]))
 
 
-def _seen(parts: Collecting, moments: Moments | tuple[()], raw: Array) -> Array:
+def _seen(parts: Collecting, moments: LongMoments | tuple[()], raw: Array) -> Array:
     """What the policy sees of raw observations `[N, *obs]`."""
-    if isinstance(moments, Moments):
-        return normalize(moments, raw, parts.config.clip_observations)
+    if isinstance(moments, LongMoments):
+        return normalize(moments.moments, raw, parts.config.clip_observations)
     return raw
 
 
@@ -218,12 +219,12 @@ def _step(
         scored = ScoredStep(observation, action, log_prob, output.value, output.vex)
         filter_state, decided = parts.filter.keep(carry.filter, scored, filter_key, hypers)
         keep = decided & acting
-    envs, told = advance(parts.env, state.envs, action, acting, env_key, parts.anywhere)
+    envs, transition = advance(parts.env, state.envs, action, acting, env_key, parts.any_member)
     moments = state.observation_moments
-    if isinstance(moments, Moments):
-        moments = update_moments(moments, envs.observation, acting)
-    reward = jnp.where(acting, told.reward, 0.0)
-    ended = told.terminated | told.truncated
+    if isinstance(moments, LongMoments):
+        moments = update_long_moments(moments, envs.observation, acting)
+    reward = jnp.where(acting, transition.reward, 0.0)
+    ended = transition.terminated | transition.truncated
     episode_return = state.episode_return + reward
     episode_length = state.episode_length + acting
     after = state._replace(
@@ -238,36 +239,38 @@ def _step(
         policy.distribution.log_prob(output.policy, action),
         reward,
         output.value,
-        _final_values(parts, params, moments, told),
+        _final_values(parts, params, moments, transition),
         output.vex,
-        told.terminated,
-        told.truncated,
+        transition.terminated,
+        transition.truncated,
         acting,
         keep,
         episode_return,
         episode_length,
-        ~acting | _finite_rows(told.observation, envs.observation, reward),
+        ~acting | _finite_rows(transition.observation, envs.observation, reward),
     )
     return _Carry(carry.t + 1, after, filter_state, carry.kept + keep), row
 
 
 def _finite_rows(*arrays: Array) -> Array:
-    return jnp.all(jnp.stack([jnp.isfinite(x.reshape(len(x), -1)).all(1) for x in arrays]), 0)
+    """Whether the numbers of each row are finite, and small enough to be squared in float32."""
+    fine = [(jnp.abs(x.reshape(len(x), -1)) <= LARGEST).all(1) for x in arrays]
+    return jnp.all(jnp.stack(fine), 0)
 
 
 def _final_values(
-    parts: Collecting, params: Array, moments: Moments | tuple[()], told: Transition
+    parts: Collecting, params: Array, moments: LongMoments | tuple[()], transition: Transition
 ) -> Array:
     """V `[N]` of what truncated episodes had reached; 0 elsewhere, and computed only for some."""
     if parts.config.truncation != "bootstrap":
-        return jnp.zeros(told.reward.shape)
+        return jnp.zeros(transition.reward.shape)
 
     def values() -> Array:
-        return parts.policy.apply(params, _seen(parts, moments, told.observation)).value
+        return parts.policy.apply(params, _seen(parts, moments, transition.observation)).value
 
-    some = parts.anywhere(jnp.any(told.truncated))
-    found = jax.lax.cond(some, values, lambda: jnp.zeros(told.reward.shape))
-    return jnp.where(told.truncated, found, 0.0)
+    some = parts.any_member(jnp.any(transition.truncated))
+    found = jax.lax.cond(some, values, lambda: jnp.zeros(transition.reward.shape))
+    return jnp.where(transition.truncated, found, 0.0)
 
 
 def _finish(
@@ -322,9 +325,9 @@ def _scaled_rewards(
 
     ended = rows.terminated | rows.truncated
     last, sums = jax.lax.scan(step, state.discounted_return, (rows.reward, ended, rows.valid))
-    own = Moments(*(part[0] for part in state.reward_moments))
-    after = moments_after_each(own, sums, rows.valid)
-    moments = Moments(*(part[-1:] for part in after))
+    own = LongMoments(*(part[0] for part in state.reward_moments))
+    after, end = long_moments_after_all(own, sums, rows.valid)
+    moments = LongMoments(*(part[None] for part in end))
     reward = scale_rewards(after, rows.reward, config.clip_rewards)
     return reward, state._replace(reward_moments=moments, discounted_return=last)
 
@@ -358,5 +361,5 @@ def _faults(rows: _Row, begun: Array) -> Faults:
     bad = bad.at[0].set(jnp.where(early, ~begun, bad[0]))
     place = jnp.argmax(bad)
     row, env = jnp.unravel_index(place, bad.shape)
-    in_reward = ~jnp.isfinite(rows.reward[row, env]) & ~early
+    in_reward = ~(jnp.abs(rows.reward[row, env]) <= LARGEST) & ~early
     return Faults(jnp.any(bad), row.astype(jnp.int32), env.astype(jnp.int32), in_reward)

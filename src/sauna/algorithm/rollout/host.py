@@ -1,9 +1,9 @@
 """Collecting rollouts from host environments, for all members of a process in lockstep.
 
-Acting, scoring and filtering are separate: the policy acts for a stretch of steps, then one
-compiled call per member computes log-probabilities, values and Vex of the whole stretch, and one
+Acting, scoring and filtering are separate: the policy acts for a segment of steps, then one
+compiled call per member computes log-probabilities, values and Vex of the whole segment, and one
 more lets the filter decide about it. A decision never changes how an env acts, so this gives the
-mask that deciding after each step would give. With `dropped="replace"` a stretch is as long as the
+mask that deciding after each step would give. With `dropped="replace"` a segment is as long as the
 smallest number of steps that some env still lacks: no env can overshoot.
 """
 
@@ -41,7 +41,7 @@ class CollectState(NamedTuple):
     episode_length: np.ndarray  # [P, N] int64
 
 
-class _Stretch(NamedTuple):
+class _Segment(NamedTuple):
     """Rows `first` to `last` of one member, in which the envs of `acting` `[N]` act."""
 
     first: int
@@ -73,7 +73,7 @@ class HostCollector:
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
         self._over = np.zeros(self._rewards.shape, bool)  # episodes; a lost life is not one's end
         self._chunks = chunk_sizes(self._config.rollout_steps)
-        self._uncompiled = program.filter is not None  # without one, every stretch is a rollout
+        self._uncompiled = program.filter is not None  # without one, every segment is a rollout
         if program.filter is not None:
             self._fresh_filter = program.filter.init(self._config.envs, self._capacity)
         self.observation_moments = self._observation_moments()
@@ -133,7 +133,7 @@ class HostCollector:
             getattr(buffers, name)[:] = False
         self._over[:] = False
         if self._uncompiled:
-            self._compile_stretches(params[0], hypers[0])
+            self._compile_segments(params[0], hypers[0])
         self._actor.load(params)
         self._show()
         filters, keys = self._start_filters(), self._filter_keys(iteration)
@@ -158,8 +158,8 @@ class HostCollector:
         self._fill_next_values(params, final_values, t)
         return [self._collected(member) for member in members]
 
-    def _compile_stretches(self, params: np.ndarray, hypers: Hypers) -> None:
-        """Compiles for every length of a stretch now, so that none has to be later on."""
+    def _compile_segments(self, params: np.ndarray, hypers: Hypers) -> None:
+        """Compiles for every length of a segment now, so that none has to be later on."""
         filters, key = self._start_filters(), self._keys[0].filter
         for size in self._chunks:
             observation, action = (
@@ -172,14 +172,14 @@ class HostCollector:
             self._program.decide(filters[0], steps, none, none, key, hypers)
         self._uncompiled = False
 
-    def _plan(self, member: int, t: int, limit: np.ndarray) -> _Stretch:
-        """A member's next stretch, from row `t` on. It depends on nothing but the member."""
+    def _plan(self, member: int, t: int, limit: np.ndarray) -> _Segment:
+        """A member's next segment, from row `t` on. It depends on nothing but the member."""
         steps = self._config.rollout_steps
         wanted = np.minimum(steps - self._buffers.keep[member].sum(0), limit[member] - t)
         if self._config.dropped == "mask":
             wanted = np.minimum(wanted, steps - t)
         acting = wanted > 0
-        return _Stretch(t, t + int(wanted[acting].min()) if acting.any() else 0, acting)
+        return _Segment(t, t + int(wanted[acting].min()) if acting.any() else 0, acting)
 
     def _draw(self, iteration: int, block: int) -> np.ndarray:
         """Action noise of T steps `[T, P, N, M]`."""
@@ -256,7 +256,7 @@ class HostCollector:
         return np.asarray(self._program.value(params[member], observation))
 
     def _score(self, params: np.ndarray, member: int, first: int, last: int) -> None:
-        """Writes log-probability, value and Vex for the rows of a member's stretch."""
+        """Writes log-probability, value and Vex for the rows of a member's segment."""
         buffers, rows = self._buffers, slice(first, last)
         observation = self._padded(buffers.observation[member, rows])
         action = self._padded(buffers.action[member, rows])
@@ -281,7 +281,7 @@ class HostCollector:
         first: int,
         last: int,
     ) -> None:
-        """Writes `keep` for the rows of a member's stretch."""
+        """Writes `keep` for the rows of a member's segment."""
         buffers, rows = self._buffers, slice(first, last)
         valid = buffers.valid[member, rows]
         if not filters:
@@ -300,7 +300,7 @@ class HostCollector:
         buffers.keep[member, rows] = np.asarray(mask)[: last - first] & valid
 
     def _padded(self, rows: np.ndarray) -> np.ndarray:
-        """`[length, ...]` -> `[chunk, ...]`: stretches of all lengths share a few programs."""
+        """`[length, ...]` -> `[chunk, ...]`: segments of all lengths share a few programs."""
         size = next(size for size in self._chunks if size >= len(rows))
         if size == len(rows):
             return rows
@@ -384,7 +384,7 @@ def running_sum(start: float, values: np.ndarray) -> float:
 
 
 def chunk_sizes(rollout_steps: int) -> list[int]:
-    """Lengths that stretches are padded to, rising: T, and T over powers of 4 down to 32."""
+    """Lengths that segments are padded to, rising: T, and T over powers of 4 down to 32."""
     sizes = [rollout_steps]
     while sizes[0] >= 128:
         sizes.insert(0, -(-sizes[0] // 4))

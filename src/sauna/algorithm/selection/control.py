@@ -8,8 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.draws import kept_first
 from sauna.algorithm.selection.scores import largest, ranks
 from sauna.algorithm.types import Array, Choice, LossTerms, LossWeight, Sampler, Samples
+from sauna.system.errors import BadInput
 
 MAX_STRIDE_ROWS = 65_535  # whose squares fit into uint32
 
@@ -51,6 +53,8 @@ def controlled(kind: str, sampler: Sampler) -> Sampler:
 
     def choose(state: Any, samples: Samples, key: Array) -> tuple[Any, Choice]:
         state, choice = sampler.choose(state, samples, key)
+        if kind == "reversed" and choice.score is None:
+            raise BadInput("control: reversed needs a sampler whose choice has a score")
         noise = jax.random.uniform(jax.random.fold_in(key, 2), samples.present.shape)
         present = samples.present
         if choice.probability is None:
@@ -89,8 +93,9 @@ def _reversed_probabilities(choice: Choice, present: Array) -> Choice:
 def controlled_weight(kind: str, rule: LossWeight) -> LossWeight:
     """A loss weight whose values are dealt to other rows of the minibatch.
 
-    A minibatch's rows stand in random order: handing each row its neighbour's weight is dealing
-    them at random. `reversed` hands the largest weight to the row that had the smallest.
+    A minibatch's rows stand in random order: handing each row the weight of the row before it, of
+    those present, is dealing them at random. `reversed` hands the largest weight to the row that
+    had the smallest.
     """
 
     def dealt(terms: LossTerms) -> tuple[Array, Array]:
@@ -102,7 +107,10 @@ def controlled_weight(kind: str, rule: LossWeight) -> LossWeight:
                 jnp.zeros_like(x).at[rank].set(x)[jnp.maximum(last - rank, 0)]
             )
             return turn(mask) * terms.present, turn(scale)
-        return jnp.roll(mask, 1) * terms.present, jnp.roll(scale, 1)
+        present = terms.present > 0
+        rows, number = kept_first(present, jnp.arange(len(present), dtype=jnp.int32))
+        before = rows[(jnp.cumsum(present) - 2) % jnp.maximum(number, 1)]
+        return mask[before] * terms.present, scale[before]
 
     return rule._replace(weight=dealt)
 

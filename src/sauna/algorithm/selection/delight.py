@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.scores import check_choice, check_range
 from sauna.algorithm.types import Array, LossTerms, LossWeight
 
 BOUND = 10.0  # of the surprisal
@@ -29,6 +30,8 @@ def delight(temperature: float = 1.0, centred: bool = True, on: str = "mean") ->
     have no log-std and are weighted whole. Source: Osband 2026, arXiv 2603.14608, whose gate has
     no factor 2; here a row without delight weighs 1.
     """
+    check_range("temperature", temperature, 1e-6)
+    check_choice("on", on, ("mean", "all"))
 
     def weight(terms: LossTerms) -> tuple[Array, Array]:
         centre = terms.entropy if centred and terms.continuous else None

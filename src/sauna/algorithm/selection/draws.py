@@ -69,6 +69,8 @@ def minibatch_count(mode: str, number: Array, full: int, minibatches: int) -> Ar
     """Gives the gradient steps of one epoch that has drawn `number` rows; none for 0 rows."""
     if mode == "fewer":
         return (number + full - 1) // full
+    if mode == "smaller":
+        return jnp.minimum(number, minibatches)
     return jnp.where(number > 0, minibatches, 0)
 
 
@@ -80,12 +82,13 @@ def minibatch_places(
     | mode | minibatches | a minibatch |
     |---|---|---|
     | `fewer` | as many as the rows fill | PPO's size; the last is filled from the front |
-    | `smaller` | as many as without a rule | an equal share of the rows |
+    | `smaller` | as many as without a rule, at most one a row | an equal share of the rows |
     | `refill` | as many as without a rule | PPO's size; the rows are gone through again |
     """
     inside = jnp.arange(size)
     if mode == "smaller":
-        first, last = i * number // minibatches, (i + 1) * number // minibatches
+        pieces = jnp.clip(number, 1, minibatches)
+        first, last = i * number // pieces, (i + 1) * number // pieces
         return jnp.minimum(first + inside, number - 1), first + inside < last
     return (i * size + inside) % jnp.maximum(number, 1), jnp.ones(size, bool)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.scores import check_range
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -15,6 +16,8 @@ def gigaflow(setup: SamplerSetup, threshold: float = 0.01, rate: float = 0.25) -
     M can outlive the advantages, so that nothing is kept: that iteration learns nothing.
     Source: arXiv 2502.03349; the constants are those of PufferDrive.
     """
+    check_range("threshold", threshold, 0.0)
+    check_range("rate", rate, 0.0, 1.0)
 
     def choose(state: Array, samples: Samples, key: Array) -> tuple[Array, Choice]:
         size = jnp.where(samples.present, jnp.abs(samples.advantage), 0.0)

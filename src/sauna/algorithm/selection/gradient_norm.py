@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.scores import check_range, check_share
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -20,6 +21,9 @@ def gradient_norm(setup: SamplerSetup, uniform: float = 0.1, share: float = 1.0)
     summed over the components c of a factored action. The value loss draws rows of its own, by
     `|R - V|`. After Katharopoulos & Fleuret 2018.
     """
+
+    check_range("uniform", uniform, 0.0, 1.0)
+    check_share(share)
 
     def mixed(score: Array, present: Array) -> Array:
         score, even = score * present, present / jnp.sum(present)
@@ -66,7 +70,7 @@ def head_gradient(setup: SamplerSetup, policy: Array, action: Array, hidden: Arr
     total, start = jnp.zeros(len(hidden)), 0
     for c, size in enumerate(setup.action_sizes):
         pi = jax.nn.softmax(policy[:, start : start + size], -1)
-        taken = jnp.take_along_axis(pi, action[:, c : c + 1].astype(jnp.int32), -1)[:, 0]
-        total += 1.0 - 2.0 * taken + jnp.sum(pi**2, -1)
+        taken = jax.nn.one_hot(action[:, c].astype(jnp.int32), size)
+        total += jnp.sum((taken - pi) ** 2, -1)  # of squares: rounding makes no negative number
         start += size
     return jnp.sqrt(total * above)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sauna.algorithm.selection.delight import surprisal
-from sauna.algorithm.selection.scores import count_of, largest
+from sauna.algorithm.selection.scores import check_share, count_of, largest
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -14,6 +14,7 @@ def kondo(setup: SamplerSetup, share: float = 0.3, centred: bool = True) -> Samp
     (`selection_losses=policy`), so that no work is saved. The policy loss is a mean over the kept.
     Source: arXiv 2603.20526, whose gate is soft; this is its limit of a hard one.
     """
+    check_share(share)
     count = count_of(share, setup.rows)
 
     def choose(state: tuple[()], samples: Samples, key: Array) -> tuple[tuple[()], Choice]:

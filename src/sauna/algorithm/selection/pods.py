@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from sauna.algorithm.selection.scores import count_of
+from sauna.algorithm.selection.scores import check_range, check_share, count_of
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -16,6 +16,11 @@ def pods(setup: SamplerSetup, length: int = 64, share: float = 0.5) -> Sampler:
     several are as good). Source: Xu et al. 2025, arXiv 2504.13818, there on whole answers of a
     language model.
     """
+    check_share(share)
+    check_range("length", length, 1)
+    if length != int(length):
+        raise ValueError(f"length must be a whole number of steps, not {length}")
+    length = int(length)
     steps, envs = setup.rollout_steps, setup.envs
     pieces = -(-steps // length)
     count = count_of(share, pieces * envs)

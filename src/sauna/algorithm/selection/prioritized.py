@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.scores import check_range, check_share
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 FLOOR = 1e-6  # so that a row of advantage 0 can be drawn
@@ -19,6 +20,10 @@ def prioritized(
     PufferLib 3, after Schaul et al. 2016; there it works on segments of 64 steps, without
     replacement, and `b` never reaches 1.
     """
+
+    check_range("power", power, 0.0)
+    check_range("correction", correction, 0.0, 1.0)
+    check_share(share)
 
     def choose(count: Array, samples: Samples, key: Array) -> tuple[Array, Choice]:
         size = (jnp.abs(samples.advantage) + FLOOR) ** power * samples.present

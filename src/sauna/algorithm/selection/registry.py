@@ -132,7 +132,7 @@ def make_filter(config: Config) -> StepFilter | None:
     """The filter that `config` names, or None where every transition is kept.
 
     Raises:
-      BadInput: a user's `module:name` is something else.
+      BadInput: a user's `module:name` is something else, or does not take its arguments.
     """
     if config.filter == "none":
         return None
@@ -143,7 +143,5 @@ def make_filter(config: Config) -> StepFilter | None:
     if config.filter == "sauna":
         rule = sauna_joint if config.decision == "joint" else sauna_per_env
         return rule(config.history, config.rollout_steps)
-    filter = import_name("filter", config.filter)
-    if not isinstance(filter, StepFilter):
-        raise BadInput(f"filter: {config.filter} is not a sauna.StepFilter")
-    return filter
+    own: StepFilter = _made("filter", config.filter, {}, StepFilter, config.filter_kwargs)
+    return own

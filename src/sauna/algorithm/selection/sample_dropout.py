@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
+from sauna.algorithm.selection.scores import check_range
 from sauna.algorithm.types import Array, LossTerms, LossWeight
 
 
@@ -13,6 +14,7 @@ def sample_dropout(deviation: float = 1.0) -> LossWeight:
     1 is for use beside the clip, 0.25 without it (`objective=unclipped`). Value and entropy see
     every row. Source: Lin et al. 2023, arXiv 2302.02299.
     """
+    check_range("deviation", deviation, 0.0)
 
     def weight(terms: LossTerms) -> tuple[Array, Array]:
         near = jnp.abs(jnp.exp(terms.log_ratio) - 1.0) < deviation

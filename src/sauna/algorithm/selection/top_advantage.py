@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.selection.scores import count_of, largest
+from sauna.algorithm.selection.scores import check_range, check_share, count_of, largest
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -16,6 +16,8 @@ def top_advantage(setup: SamplerSetup, share: float = 0.5, leak: float = 0.0) ->
     (`normalize_over=rollout`): the mean of the kept is not 0, and subtracting it would flip signs
     near it.
     """
+    check_share(share)
+    check_range("leak", leak, 0.0, 1.0)
     count = count_of(share, setup.rows)
 
     def choose(state: tuple[()], samples: Samples, key: Array) -> tuple[tuple[()], Choice]:

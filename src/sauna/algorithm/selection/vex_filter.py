@@ -73,8 +73,8 @@ def sauna_joint(history: str, quota: int) -> StepFilter:
     return StepFilter(init, keep)
 
 
-class Held(NamedTuple):
-    """What a held keep rate looks back on, for each env."""
+class RateState(NamedTuple):
+    """What a target keep rate looks back on, for each env."""
 
     history: History  # of |Vex|
     kept: Array  # [N] int32
@@ -98,25 +98,27 @@ def sauna_at_rate(rate: float) -> StepFilter:
     history it begins anew with each rollout; a member whose `threshold` is 0 keeps everything.
     """
 
-    def init(num_envs: int, capacity: int) -> Held:
-        return Held(empty_history((num_envs,), capacity), jnp.zeros(num_envs, jnp.int32))
+    def init(num_envs: int, capacity: int) -> RateState:
+        return RateState(empty_history((num_envs,), capacity), jnp.zeros(num_envs, jnp.int32))
 
-    def keep(state: Held, step: ScoredStep, key: Array, hypers: Hypers) -> tuple[Held, Array]:
+    def keep(
+        state: RateState, step: ScoredStep, key: Array, hypers: Hypers
+    ) -> tuple[RateState, Array]:
         size = jnp.abs(step.vex)
-        mask = ~(size < held_edge(state, rate)) | (hypers.threshold <= 0)
-        return Held(insert(state.history, size), state.kept + mask), mask
+        mask = ~(size < rate_edge(state, rate)) | (hypers.threshold <= 0)
+        return RateState(insert(state.history, size), state.kept + mask), mask
 
     return StepFilter(init, keep)
 
 
-def held_edge(state: Held, rate: float) -> Array:
-    """What |Vex| has to reach to be kept at a held keep rate, `[N]`; see `sauna_at_rate`."""
+def rate_edge(state: RateState, rate: float) -> Array:
+    """What |Vex| has to reach to be kept at a target keep rate, `[N]`; see `sauna_at_rate`."""
     number = state.history.number
     level = (1.0 - rate) + (state.kept - rate * number) / SETTLE
     return quantile(state.history.ordered, number, level)
 
 
-def threshold_held(vex: Array, valid: Array, rate: float) -> Array:
+def threshold_for_rate(vex: Array, valid: Array, rate: float) -> Array:
     """The threshold of eq. 7 that would keep the share `rate` of a rollout's steps `[S, N]`."""
     number = jnp.sum(valid)
 
@@ -132,6 +134,6 @@ def moved_threshold(rollout: Rollout, hypers: Hypers, config: Config) -> Array:
     """The threshold of this iteration; NaN where it is the config's own, or nothing is filtered."""
     unmoved = jnp.float32(jnp.nan)
     if config.keep_rate_target:
-        held = threshold_held(rollout.vex, rollout.valid, config.keep_rate_target)
-        return jnp.where(hypers.threshold > 0, held, unmoved)
+        found = threshold_for_rate(rollout.vex, rollout.valid, config.keep_rate_target)
+        return jnp.where(hypers.threshold > 0, found, unmoved)
     return unmoved if config.threshold_schedule == "constant" else jnp.float32(hypers.threshold)

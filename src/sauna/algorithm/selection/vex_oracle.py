@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from sauna.algorithm.selection.scores import count_of, largest
+from sauna.algorithm.selection.scores import check_choice, check_share, count_of, largest
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
@@ -15,6 +15,8 @@ def vex_oracle(setup: SamplerSetup, share: float = 0.5, keep: str = "high") -> S
     is known once the rollout is complete: whether this helps says whether SAUNA's idea or its
     prediction fails. If the returns do not vary, every share is 0.
     """
+    check_share(share)
+    check_choice("keep", keep, ("high", "low", "both"))
     count = count_of(share, setup.rows)
     high = {"high": count, "low": 0, "both": (count + 1) // 2}[keep]
 

@@ -39,11 +39,11 @@ class HostFace(gymnasium.Env):
         return self._read(observation), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        told = self._step(self._state, action)
-        self._state = told.state
-        truncated = bool(told.truncated) and not bool(told.terminated)
-        seen = self._read(told.observation)
-        return seen, float(told.reward), bool(told.terminated), truncated, {}
+        transition = self._step(self._state, action)
+        self._state = transition.state
+        truncated = bool(transition.truncated) and not bool(transition.terminated)
+        seen = self._read(transition.observation)
+        return seen, float(transition.reward), bool(transition.terminated), truncated, {}
 
     def _read(self, observation: Any) -> Any:
         return jax.tree.map(np.asarray, observation)

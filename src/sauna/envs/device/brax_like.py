@@ -61,10 +61,10 @@ def from_brax(
                 inner = env.step(inner, action)
                 reward += inner.reward
         steps = state.steps + 1
-        told = Transition(
+        transition = Transition(
             State(inner, steps), seen(inner), reward, inner.done > 0, jnp.asarray(steps >= limit)
         )
-        return ended_where_broken(told)
+        return ended_where_broken(transition)
 
     unbounded = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
     actions = gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)

@@ -51,18 +51,18 @@ class JaxEnv(NamedTuple):
     frames_per_second: float = 30.0
 
 
-def ended_where_broken(told: Transition) -> Transition:
+def ended_where_broken(transition: Transition) -> Transition:
     """A simulation whose numbers are not finite any more ends its episode, with zeros to see.
 
-    For physics alone, where that is a known end; other environments are told of as faulty.
+    For physics alone, where that is a known end; other environments are reported as faulty.
     """
-    sound = jnp.all(jnp.isfinite(told.observation)) & jnp.isfinite(told.reward)
-    terminated = told.terminated | ~sound
-    return told._replace(
-        observation=jnp.where(sound, told.observation, 0.0),
-        reward=jnp.where(sound, told.reward, 0.0),
+    sound = jnp.all(jnp.isfinite(transition.observation)) & jnp.isfinite(transition.reward)
+    terminated = transition.terminated | ~sound
+    return transition._replace(
+        observation=jnp.where(sound, transition.observation, 0.0),
+        reward=jnp.where(sound, transition.reward, 0.0),
         terminated=terminated,
-        truncated=told.truncated & ~terminated,
+        truncated=transition.truncated & ~terminated,
     )
 
 
@@ -179,7 +179,7 @@ def advance(
     action: Array,
     acting: Array,
     key: Array,
-    anywhere: Callable[[Array], Array],
+    any_member: Callable[[Array], Array],
 ) -> tuple[Running, Transition]:
     """One env step of the acting environments; where an episode ends, the next one begins.
 
@@ -187,7 +187,7 @@ def advance(
       action: `[N, A]`; acting: `[N]` bool, the others stay where they are.
       key: the one given to `begin`; episode e of environment n is reset with a key made of it, n
         and e. Not read with cached resets, which return to the environment's first state.
-      anywhere: `bool -> bool`, whether it holds in any member that is compiled together with this
+      any_member: `bool -> bool`, whether it holds in any member that is compiled together with this
         one: then alone is the reset computed.
 
     Returns:
@@ -207,11 +207,11 @@ def advance(
     if running.first:
         start = _with_new_keys(running.first, episode)
     else:
-        start = jax.lax.cond(anywhere(jnp.any(ended)), fresh, lambda: reached)
+        start = jax.lax.cond(any_member(jnp.any(ended)), fresh, lambda: reached)
     now = (running.state, running.observation)
     state, observation = _where(acting, _where(ended, start, reached), now)
-    told = transition._replace(terminated=terminated, truncated=truncated)
-    return Running(state, observation, episode, running.first), told
+    transition = transition._replace(terminated=terminated, truncated=truncated)
+    return Running(state, observation, episode, running.first), transition
 
 
 def _with_new_keys(first: Any, episode: Array) -> Any:

@@ -44,7 +44,7 @@ def make_jax_env(env: str, env_kwargs: dict[str, Any]) -> JaxEnv:
         raise BadInput(f"backend: {env} on the device needs `pip install 'sauna-rl[mjx]'`")
     path = HOST_ENVS.get(env, env)
     if ":" not in path:
-        raise BadInput(f"backend: {env} has no face on the device; known are {_known()}")
+        raise BadInput(f"backend: {env} does not run on the device; known are {_known()}")
     thing = import_name("env", path)
     if not isinstance(thing, JaxEnv):
         thing = _made(env, lambda: thing(**env_kwargs))

@@ -88,14 +88,14 @@ def on_mjx(task: MjxTask, impl: str = "jax") -> JaxEnv:
                 0, task.frame_skip, lambda _, data: mjx.step(model, data), before
             )
             steps = state.steps + 1
-            told = Transition(
+            transition = Transition(
                 state_of(after, steps),
                 task.observe(after),
                 task.reward(before, after, action),
                 task.terminated(after),
                 steps >= task.time_limit,
             )
-            return ended_where_broken(told)
+            return ended_where_broken(transition)
 
     low, high = task.model.actuator_ctrlrange.T.astype(np.float32)
     size = jax.eval_shape(lambda key: reset(key)[1], jax.random.key(0)).shape

@@ -1,7 +1,7 @@
 """HumanoidFlagrunHarder: a humanoid runs to flags, gets up when it fell, and is thrown a cube at.
 
 `host.py` is the Gymnasium environment on MuJoCo, `device.py` the same for the accelerator; both
-step `humanoid.xml` and share `task.py`. Importing this package tells Gymnasium of the environment.
+step `humanoid.xml` and share `task.py`. Importing this package registers the environment.
 """
 
 from __future__ import annotations
@@ -10,5 +10,5 @@ import gymnasium
 
 ID = "sauna/HumanoidFlagrunHarder-v0"
 
-# The environment truncates by itself, so that both faces share the time limit.
+# The environment truncates by itself, so that both forms share the time limit.
 gymnasium.register(ID, "sauna.envs.flagrun.host:HumanoidFlagrunHarder")

@@ -93,7 +93,7 @@ def after_throw(xp: Any, thrown: Throw, qpos: Array, qvel: Array) -> tuple[Array
 
 
 def spaces() -> tuple[Any, Any]:
-    """The observation and the action space, of both faces."""
+    """The observation and the action space, of both forms."""
     from gymnasium.spaces import Box
 
     observation = Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (OBSERVATIONS,), np.float32)

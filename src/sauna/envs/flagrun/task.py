@@ -5,7 +5,7 @@ Every function works on numpy and on jax.numpy arrays alike: it takes the module
 so that a host's generator and a device's key serve the same functions.
 
 The task is Roboschool's (Schulman et al. 2017, section 6.2), read from its first release and from
-its port to Bullet; `docs/flagrun.md` lists where this one differs.
+its port to Bullet; `docs/reference/flagrun.md` lists where this one differs.
 """
 
 from __future__ import annotations

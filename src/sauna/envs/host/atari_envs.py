@@ -5,7 +5,7 @@ last two are seen (the larger of each pixel), grey, 84 x 84, behind the three st
 begins with FIRE, where there is one, and no-ops, up to 30 frames in all. Rewards are the game's
 own.
 
-Three things are done here because ale-py (0.12) does them otherwise. A lost life is told as such
+Three things are done here because ale-py (0.12) does them otherwise. A lost life is reported
 and the game goes on: ale-py's `episodic_life` begins a new game, so that later lives are never
 played, and its `life_loss_info` makes an end of it. The time limit is counted here: where ale-py
 truncates, it leaves out the last frame and shows one of the step before instead. And a vector
@@ -76,7 +76,7 @@ class AtariEnv(gymnasium.Env):
       noop_max: most frames that pass before the first observation, FIRE among them (which passes
         also where this is 0).
       use_fire_reset: whether FIRE is pressed first, in games that wait for it.
-      episodic_life: whether `info["life_lost"]` tells that a life was lost and the game goes on.
+      episodic_life: whether `info["life_lost"]` says that a life was lost and the game goes on.
       max_num_frames_per_episode: the time limit, in frames after the first observation.
       render_mode: `rgb_array` for pictures of the game itself, or None.
     """

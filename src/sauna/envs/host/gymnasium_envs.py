@@ -7,7 +7,6 @@ the snapshot. That is exact for every environment that is deterministic given th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,9 +17,16 @@ from sauna.envs.host.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.system.errors import SaunaError, one_line
 
+LARGEST = 1e38  # of an observation or a reward: float32 and the running moments hold no more
+
 
 class EnvironmentFailure(SaunaError):
     """An environment raised, or gave numbers that cannot be learned from."""
+
+
+def _square(x: np.ndarray) -> float:
+    """The sum of squares: NaN or infinite where a number is, or is too large to be squared."""
+    return float(np.vdot(x, x))
 
 
 class Slot:
@@ -130,7 +136,7 @@ class GymnasiumEnvs(HostEnvs):
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
             self._put(self._final, index, observation)
-            self._final_sum = self._final.sum()
+            self._final_sum = _square(self._final)
             self._check_finite(np.arange(len(self._slots)) == index)
             self._start_episode(index, slot)
             return True
@@ -139,17 +145,22 @@ class GymnasiumEnvs(HostEnvs):
         return lost
 
     def _check_finite(self, active: np.ndarray) -> None:
-        """One sum tells whether anything is amiss; only then the culprit is looked for."""
+        """Refuses what is not finite, or too large: one sum tells; then the culprit is looked for.
+
+        Raises:
+          EnvironmentFailure: naming the environment, the step and the number.
+        """
         if self._is_finite():
             return
         for index in np.flatnonzero(active).tolist():
             slot = self._slots[index]
             where = f"{slot.name}, episode {slot.episode}, step {self._steps_taken(index)}"
-            if not np.isfinite(self._reward[index]):
+            if not abs(self._reward[index]) <= LARGEST:
                 raise EnvironmentFailure(f"{where}: reward is {self._reward[index]}")
             for row in (self._observation[index], self._final[index]):
-                if not np.isfinite(row).all():
-                    component = int(np.flatnonzero(~np.isfinite(row))[0])
+                usable = np.abs(row) <= LARGEST
+                if not usable.all():
+                    component = int(np.flatnonzero(~usable)[0])
                     value = row.reshape(-1)[component]
                     raise EnvironmentFailure(f"{where}: observation[{component}] is {value}")
 
@@ -159,8 +170,9 @@ class GymnasiumEnvs(HostEnvs):
 
     def _is_finite(self) -> bool:
         if self.spaces.observation_kind == "image":  # bytes are finite, and many
-            return math.isfinite(self._reward.sum())
-        return math.isfinite(self._observation.sum() + self._reward.sum() + self._final_sum)
+            return _square(self._reward) <= LARGEST**2
+        squares = _square(self._observation) + _square(self._reward) + self._final_sum
+        return squares <= LARGEST**2
 
     def snapshot(self, index: int) -> Snapshot:
         slot = self._slots[index]

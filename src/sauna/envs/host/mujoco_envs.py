@@ -19,7 +19,7 @@ from sauna.envs.host.mujoco_tasks import TASKS, Outcome, make_task
 from sauna.system.compiled import compiled
 from sauna.system.errors import one_line
 
-ROOM = 1000  # steps of an episode that there is room for from the start
+CAPACITY = 1000  # steps of an episode that memory is taken for at the start
 
 
 def time_limit(env: Any) -> int | None:
@@ -52,7 +52,7 @@ class MujocoEnvs(GymnasiumEnvs):
         self._clipped = np.zeros((len(envs), len(self._low)), np.float32)
         self._outcome = Outcome(self._observation, self._reward, self._terminated)
         # The actions of the running episodes `[M, room, A]`, of which `_steps` `[M]` are taken.
-        self._actions = np.zeros((len(envs), min(limit, ROOM), len(self._low)), np.float32)
+        self._actions = np.zeros((len(envs), min(limit, CAPACITY), len(self._low)), np.float32)
         self._steps = np.zeros(len(envs), np.int64)
         # Compiles the loops here, where no time limit of a step counts; nobody is active.
         self.step(np.zeros_like(self._clipped), np.zeros(len(envs), bool))

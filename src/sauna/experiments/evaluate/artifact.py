@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 from sauna.config.presets import RunConfig
 from sauna.config.settings import Config
 from sauna.config.stored import read_stored
-from sauna.envs.spaces import Spaces, describe, read_spaces
+from sauna.config.trust import check_trusted
+from sauna.envs.spaces import Spaces, describe, difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
+from sauna.system.logs import check_logs
 
 
 class Artifact(NamedTuple):
@@ -29,18 +31,22 @@ class Artifact(NamedTuple):
 
 
 def load_artifact(
-    run: Path, warn: Callable[[str], None] = print, iteration: int | None = None
+    run: Path,
+    warn: Callable[[str], None] = print,
+    iteration: int | None = None,
+    trust: bool = False,
 ) -> Artifact:
     """Reads a run's newest good checkpoint, or the one of an iteration.
 
     Raises:
-      BadInput: no run there, no checkpoint yet, or none of that iteration.
+      BadInput: no run there, no checkpoint yet, none of that iteration, or one that names code of
+        somebody else's, which `trust` allows.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
-    run_directory.read_config(run)
+    stored = run_directory.read_config(run, needed=())
     kept = [int(path.name) for path in checkpoint.numbered(run / "checkpoints")]
     if iteration is None:
-        loaded = checkpoint.load_newest(run / "checkpoints", warn)
+        loaded = _newest(run, warn)
     elif iteration not in kept:
         known = ", ".join(map(str, kept)) or "none"
         raise BadInput(f"checkpoint: {run} keeps none of iteration {iteration} (it has: {known})")
@@ -48,6 +54,7 @@ def load_artifact(
         loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     if loaded is None:
         raise BadInput(f"{run} has no checkpoint yet")
+    check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust)
     try:
         spaces = read_spaces(loaded.manifest["spaces"])
     except (TypeError, ValueError, LookupError) as error:
@@ -55,8 +62,24 @@ def load_artifact(
     return Artifact(read_stored(loaded.manifest), spaces, loaded.manifest["members"], loaded)
 
 
+def _newest(run: Path, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
+    """The newest checkpoint that is good and whose rows are all there; else, the newest good one.
+
+    Raises:
+      BadCheckpoint: there are checkpoints, but none is good.
+    """
+    try:
+        return checkpoint.load_newest(
+            run / "checkpoints", warn, lambda manifest: check_logs(run, manifest)
+        )
+    except checkpoint.BadCheckpoint:
+        loaded = checkpoint.load_newest(run / "checkpoints", lambda text: None)
+        warn("warning: no checkpoint has all its rows; the newest one is used")
+        return loaded
+
+
 def find_member(members: list[str], member: str | int) -> str:
-    if isinstance(member, int) or member.isdigit():
+    if isinstance(member, int) or member.isdecimal():
         index = int(member)
         if not 0 <= index < len(members):
             raise BadInput(f"member: {index} is not between 0 and {len(members) - 1}")
@@ -73,9 +96,5 @@ def check_spaces(artifact: Artifact, env: Any) -> None:
       BadInput: naming the space that differs.
     """
     found = describe(env.observation_space, env.action_space)
-    for part in ("observation_text", "action_text"):
-        ours, theirs = getattr(artifact.spaces, part), getattr(found, part)
-        if ours != theirs:
-            kind = part.split("_")[0]
-            text = f"env: the run's {kind} space is {ours}, this environment's {theirs}"
-            raise BadInput(" ".join(text.split()))
+    if differs := difference(artifact.spaces, found):
+        raise BadInput(f"env: has other spaces than the run: {differs}")

@@ -16,9 +16,10 @@ from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.experiments.evaluate.play import Episode, Progress, play
-from sauna.experiments.evaluate.video import film
+from sauna.experiments.evaluate.video import record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.system.working_folder import kept_folder
 
 
 class VideoFailure(SaunaError):
@@ -29,6 +30,7 @@ class VideoFailure(SaunaError):
         self.result = result
 
 
+@kept_folder()
 def evaluate(
     run: str | Path,
     *,
@@ -41,6 +43,7 @@ def evaluate(
     checkpoint: int | None = None,
     max_steps: int = MAX_STEPS,
     video: bool = False,
+    trust: bool = False,
     say: Callable[[str], None] = print,
     **parts: Any,
 ) -> dict[str, Any]:
@@ -58,7 +61,8 @@ def evaluate(
       env_kwargs: keyword arguments of the environment: on the run's own, they change the run's.
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       max_steps: env steps after which an episode that has not ended is cut.
-      video: also films the first member's first episode.
+      video: also records the first member's first episode.
+      trust: the code that the run names may run, even if another user named it.
       say: is called with a line about checkpoints that cannot be trusted, progress, and episodes
         that were cut.
       **parts: those that were passed by value when the run started (`network`, ...).
@@ -70,11 +74,11 @@ def evaluate(
       BadInput: no such run, member or checkpoint, impossible numbers, or `env` has other spaces.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
-    run = Path(run)
+    run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    artifact = load_artifact(run, say, checkpoint, trust=trust)
     env = _provided(run, env, parts)
-    artifact = load_artifact(run, say, checkpoint)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]
     own = artifact.config.env
     mode = "deterministic" if deterministic else "sampled"
@@ -88,20 +92,20 @@ def evaluate(
     kwargs = kwargs_of(artifact, env, env_kwargs)
     if env_kwargs:
         result["env_kwargs"] = kwargs
-    world = make_env(result["env"], kwargs)
-    check_spaces(artifact, world)
+    made = make_env(result["env"], kwargs)
+    check_spaces(artifact, made)
     from sauna.experiments.evaluate.policy import TrainedPolicy  # imports JAX, so after the checks
 
     for name in chosen:
-        policy = TrainedPolicy(artifact, name, world)
+        policy = TrainedPolicy(artifact, name, made)
         progress = Progress(name, episodes, say)
         played = [
-            progress.played(play(policy, world, deterministic, seed + i, progress.step, max_steps))
+            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played)
         progress.say_cut(max_steps)
-    close(world)
+    close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
         run_directory.write_json(run / f"evaluation_{mode}.json", result)
     if video:
@@ -110,7 +114,9 @@ def evaluate(
         )
         path = run / "videos" / f"{label}.mp4"
         try:
-            film(path, artifact, chosen[0], result["env"], kwargs, deterministic, seed, max_steps)
+            record_video(
+                path, artifact, chosen[0], result["env"], kwargs, deterministic, seed, max_steps
+            )
         except SaunaError as error:
             raise VideoFailure(str(error), result) from error
         result["video"] = str(path)

@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sauna.algorithm.policy.normalize import Moments, normalize
@@ -15,6 +14,7 @@ from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
 from sauna.envs.spaces import action_writer, observation_reader
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member
+from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.loop.member_state import fitting, flat_params, under
 
 CHUNK = 512  # observations of one call of `predict`: one compiled shape, and bounded memory
@@ -44,10 +44,11 @@ class TrainedPolicy:
         if made:
             close(env)
         own = under(self.name + "/", artifact.checkpoint.arrays)
+        if len(self.config.hidden) > len(own):  # each layer has arrays of its own
+            raise BadCheckpoint(f"{artifact.checkpoint.path}: it lacks layers that its config has")
         self._policy: Policy = make_policy(self.config, artifact.spaces)
         example = jax.eval_shape(self._policy.init, jax.random.key(0))
-        zeros = jnp.zeros(example.shape, example.dtype)
-        self._params = flat_params(self._policy, zeros, under("params/", own))
+        self._params = flat_params(self._policy, example, under("params/", own))
         if self.config.normalize_observations:
             size = artifact.spaces.observation_shape
             parts = {"mean": size, "variance": size, "count": (1,)}

@@ -18,9 +18,10 @@ from sauna.envs.make import make_drawn_env
 from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.play import play
 from sauna.system.errors import SaunaError, one_line
+from sauna.system.safe_write import own_folder, replacing
 
 
-def film(
+def record_video(
     path: Path,
     artifact: Artifact,
     member: str,
@@ -30,7 +31,7 @@ def film(
     seed: int,
     max_steps: int,
 ) -> None:
-    """Films one episode to an mp4 file; without an episode there is no file.
+    """Records one episode to an mp4 file; without an episode there is no file.
 
     Raises:
       SaunaError: the environment cannot render on this machine, or gives no pictures.
@@ -38,23 +39,20 @@ def film(
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
     choose_renderer()
-    path.parent.mkdir(exist_ok=True)
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part.mp4")
+    own_folder(path.parent)
     try:
-        drawn = make_drawn_env(env, env_kwargs)
-        try:
-            policy = TrainedPolicy(artifact, member, drawn)
-            with video(part, frames_per_second(drawn)) as add:
-                play(policy, drawn, deterministic, seed, lambda: add(drawn.render()), max_steps)
-        finally:
-            close(drawn)
-        os.replace(part, path)
+        with replacing(path) as part:
+            drawn = make_drawn_env(env, env_kwargs)
+            try:
+                policy = TrainedPolicy(artifact, member, drawn)
+                with video(part, frames_per_second(drawn)) as add:
+                    play(policy, drawn, deterministic, seed, lambda: add(drawn.render()), max_steps)
+            finally:
+                close(drawn)
     except SaunaError:
         raise
     except Exception as error:  # renderers and encoders fail in every way there is
         raise SaunaError(f"video: {not_drawn(error)}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -8,8 +8,11 @@ from pathlib import Path
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import find_member, load_artifact
 from sauna.system.errors import BadInput
+from sauna.system.safe_write import replace_file
+from sauna.system.working_folder import kept_folder
 
 
+@kept_folder()
 def inspect(
     run: str | Path,
     *,
@@ -20,6 +23,7 @@ def inspect(
     out: str | Path | None = None,
     frames: bool = True,
     max_steps: int = MAX_STEPS,
+    trust: bool = False,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Plays episodes with a member's policy and writes one self-contained page about them.
@@ -32,6 +36,7 @@ def inspect(
       out: the page; default `RUN/inspect_MEMBER_MODE.html`.
       frames: draw the environment; where that fails, one line says so and the page has none.
       max_steps: env steps after which an episode that has not ended is cut.
+      trust: the code that the run names may run, even if another user named it.
       say: receives a line for each checkpoint that cannot be trusted, and for missing frames.
 
     Returns:
@@ -40,18 +45,18 @@ def inspect(
     Raises:
       BadInput: no such run or member, impossible numbers, or a page that cannot be put there.
     """
-    run = Path(run)
+    run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
-    artifact = load_artifact(run, say)
+    artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"
-    path = Path(out) if out else run / f"inspect_{name.replace('/', '-')}_{mode}.html"
+    path = Path.cwd() / out if out else run / f"inspect_{name.replace('/', '-')}_{mode}.html"
     if path.is_dir() or not path.parent.is_dir():
         raise BadInput(f"out: {path} is a folder, or not in one")
     from sauna.experiments.inspect.inspection import examine  # imports JAX, so after the checks
     from sauna.experiments.inspect.page import make_page
 
     found = examine(run, artifact, name, episodes, deterministic, seed, frames, say, max_steps)
-    path.write_text(make_page(found, run), encoding="utf-8")
+    replace_file(path, make_page(found, run).encode())
     return path

@@ -18,7 +18,7 @@ from sauna.algorithm.learner.samples import advantages_over_all, advantages_over
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.selection.history import History, median
 from sauna.algorithm.selection.registry import make_filter
-from sauna.algorithm.selection.vex_filter import EPSILON, Held, held_edge
+from sauna.algorithm.selection.vex_filter import EPSILON, RateState, rate_edge
 from sauna.algorithm.types import Array, Hypers, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 
@@ -52,12 +52,12 @@ def standards(config: Config, state: Any, hypers: Hypers) -> tuple[Array, Array]
     """Returns what the next prediction is compared with: median and edge, `[N]` or `[1]` each."""
     if config.filter != "sauna":
         return jnp.full(1, jnp.nan), jnp.full(1, jnp.nan)
-    history = state.history if isinstance(state, Held) else state
+    history = state.history if isinstance(state, RateState) else state
     assert isinstance(history, History)
     middle = median(history)
     edge = hypers.threshold * (jnp.abs(middle) + EPSILON)
-    if isinstance(state, Held):
-        least = held_edge(state, config.keep_rate_target)
+    if isinstance(state, RateState):
+        least = rate_edge(state, config.keep_rate_target)
         edge = jnp.maximum(least, 0.0)
     known = history.number > 0
     return tuple(jnp.atleast_1d(jnp.where(known, x, jnp.nan)) for x in (middle, edge))  # type: ignore[return-value]

@@ -24,6 +24,7 @@ from sauna.experiments.evaluate.video import frames_per_second
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
 from sauna.experiments.inspect.recording import Played, open_env, play_episodes, play_steps
 from sauna.system import run_directory
+from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under
 
@@ -66,7 +67,9 @@ def examine(
     """Plays, and computes what the page shows."""
     manifest = artifact.checkpoint.manifest
     everyone = artifact.run.members
-    member = next(one for one in everyone if one.name == name)
+    member = next((one for one in everyone if one.name == name), None)
+    if member is None:
+        raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
     config, iteration = member.config, int(manifest["iteration"])
     kwargs = json.loads(config.env_kwargs)
     env, drawer = open_env(config.env, kwargs, frames, say)

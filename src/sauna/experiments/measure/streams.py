@@ -25,10 +25,11 @@ from sauna.algorithm.types import Array, Hypers, Rollout, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.config.stored import read_stored
+from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
 from sauna.system import run_directory
-from sauna.system.checkpoint import load_checkpoint
+from sauna.system.checkpoint import BadCheckpoint, load_checkpoint
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, fitting, flat_params, moments_of, under
 
@@ -83,16 +84,19 @@ def load_snapshot(run: Path, name: str, iteration: int) -> MemberSnapshot:
     """
     stored = run_directory.read_config(run)
     loaded = load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
+    check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust=False)
     settings = read_stored(loaded.manifest)
     spaces = read_spaces(loaded.manifest["spaces"])
     config, everyone = settings.config, settings.members
-    place = next(p for p, member in enumerate(everyone) if member.name == name)
+    place = next((p for p, member in enumerate(everyone) if member.name == name), None)
+    if place is None:
+        raise BadCheckpoint(f"{loaded.path}: its config has no member {name!r}")
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)
     example = program.policy.init(jax.random.key(0))
     params = flat_params(program.policy, example, under("params/", arrays))
     counters = Counters.from_arrays(arrays)
-    rates = stored["drop_rates"][place] if stored["drop_rates"] else []
+    rates = stored["drop_rates"][place] if stored.get("drop_rates") else []
     hypers = hypers_now(everyone[place].config, rates, counters, iteration)
     return MemberSnapshot(
         run,

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.system.safe_write import own_folder, replacing
+
 # Okabe and Ito's palette, which the colour-blind can tell apart; an arm always has its colour.
 COLOURS = {
     "ppo": "#0072B2",
@@ -166,8 +168,9 @@ def fit_axes(axes: Any, lines: Any) -> None:
 
 def save(figure: Any, path: Path) -> Path:
     """Writes a figure to a file; its bytes depend on what it shows alone."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata=_METADATA[path.suffix])
+    own_folder(path.parent)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, metadata=_METADATA[path.suffix])
     return path
 
 

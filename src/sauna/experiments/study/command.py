@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import signal
@@ -20,15 +19,17 @@ from sauna.config.presets import (
     algorithm_of,
     chosen_preset,
 )
+from sauna.config.trust import check_trusted, covers, seal
 from sauna.envs.probe import Probe
 from sauna.experiments.sequential import DESIGN
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
+from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
-from sauna.experiments.study.rounds import first_look, next_round, round_units, stopped
+from sauna.experiments.study.rounds import every_unit, first_look, next_round, round_units, stopped
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
 from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.text import lines
@@ -38,11 +39,11 @@ from sauna.experiments.study.units import (
     most_seeds,
     seeds_per_unit,
     study_identity,
-    units_of,
 )
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
+from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import examine, look_at, place
 
 
@@ -130,6 +131,7 @@ def study(
     on: str = "local",
     address: str = "",
     quiet: bool = False,
+    accept_changed_code: bool = False,
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
@@ -143,6 +145,7 @@ def study(
       on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
       address: of the cluster.
       quiet: show nothing.
+      accept_changed_code: take runs of before as they are, even if their code is not what it was.
 
     Returns:
       the summary.
@@ -160,13 +163,17 @@ def study(
         ray_cluster.check(address)
     elif address:
         raise BadInput("address: read with --on ray only")
-    _check_runs(spec)
+    out = Path.cwd() / out  # an environment may go elsewhere
+    with kept_folder():
+        _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
-        return _train(LocalExecutor, spec, out, command, jobs, command, quiet)
+        return _train(LocalExecutor, spec, out, command, jobs, command, quiet, accept_changed_code)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with ray_cluster.connected(address, jobs) as jobs:
-        return _train(ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet)
+        return _train(
+            ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet, accept_changed_code
+        )
 
 
 def _check_runs(spec: Spec) -> None:
@@ -207,6 +214,7 @@ def _train(
     jobs: int,
     again: str,
     quiet: bool,
+    accept_changed_code: bool,
 ) -> dict[str, Any]:
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
@@ -214,6 +222,9 @@ def _train(
     with _locked(folder):
         _note(spec, place, size)
         say = _silent if quiet else partial(print, flush=True)
+        units = every_unit(spec, size)
+        check_same_code(units, folder, accept_changed_code)
+        reopen_damaged(units, folder, say)
         say(_opening(spec, place))
         for note in before_training(spec):
             say(note)
@@ -235,7 +246,6 @@ def _train(
             if spec.looks:
                 units = _run_looks(spec, size, folder, run, say, noted)
             else:
-                units = units_of(spec, size)
                 run(spec, units)
     summary = write(spec, units, folder, place, command)
     if noted:
@@ -305,10 +315,13 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
     if place.exists() and not place.is_dir():
         raise BadInput(f"out: {place} is no folder")
     if path.is_file():
-        stored = json.loads(path.read_text())
-        if not _is_same(stored["study"], spec):
+        stored = run_directory.read_config_file(path)
+        text, size = stored.get("study"), stored.get("seeds_per_unit")
+        if not isinstance(text, dict) or not isinstance(size, int) or size < 1:
+            raise BadInput(f"out: {path} is not what a study writes")
+        if not covers(spec.text, text) or not _is_same(text, spec):
             raise BadInput(f"study: {place} holds another study of this name; give --out")
-        return int(stored["seeds_per_unit"])
+        return size
     return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(first_look(spec), jobs)
 
 
@@ -318,7 +331,20 @@ def _note(spec: Spec, place: Path, size: int) -> None:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"out: cannot make {place}: {error.strerror}") from error
-    run_directory.write_json(place / "study.json", {"study": spec.text, "seeds_per_unit": size})
+    run_directory.write_json(
+        place / "study.json", {"study": spec.text, "seeds_per_unit": size, "seal": seal(spec.text)}
+    )
+
+
+def check_study(text: Mapping[str, Any], out: Path, trust: bool) -> None:
+    """Refuses code that a study's file names, unless this user has run it before.
+
+    Raises:
+      BadInput: with everything that is named.
+    """
+    path = out / str(text["name"]) / "study.json"
+    stored = run_directory.read_config_file(path) if path.is_file() else {}
+    check_trusted(text, f"study {text['name']!r}", stored.get("seal"), trust)
 
 
 def _is_same(text: Mapping[str, Any], spec: Spec) -> bool:

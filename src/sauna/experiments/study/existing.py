@@ -27,8 +27,9 @@ UNREAD: dict[str, Any] = {
     "processes": "0",
     "on": "local",
     "address": "",
+    "rules": "",
+    "controls": True,
 }
-UNREAD |= {"rules": "", "controls": True}
 LAST = 0.1  # share of the compared env steps whose mean return is the final return
 
 

@@ -26,6 +26,7 @@ from sauna.experiments.study import tables
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.summary import ABLATION
+from sauna.system.safe_write import replace_file
 
 # A shape beside the colour of each kind of verdict.
 MARKS = {
@@ -64,7 +65,7 @@ def write_report(
     write_figures(results, summary, folder, section)
     path = folder / "report.html"
     folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(make_page(results, summary, section), encoding="utf-8")
+    replace_file(path, make_page(results, summary, section).encode())
     return path
 
 

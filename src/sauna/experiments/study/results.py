@@ -61,7 +61,7 @@ def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
     for unit in units:
         for part in parts(unit, folder):
             path = part.run(folder) / "config.json"
-            stored = json.loads(path.read_text()) if path.is_file() else {}
+            stored = run_directory.read_config_file(path) if path.is_file() else {}
             for name, values in found.items():
                 if name in stored and stored[name] not in values:
                     values.append(stored[name])

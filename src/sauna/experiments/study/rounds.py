@@ -62,6 +62,20 @@ def first_look(spec: Spec) -> Spec:
     return _at_look(spec, 0, dict.fromkeys(spec.tasks, labels))
 
 
+def every_unit(spec: Spec, size: int) -> list[Unit]:
+    """Returns all units that a study may come to train."""
+    if not spec.looks:
+        return units_of(spec, size)
+    labels = {arm.label for arm in spec.arms}
+    needed = dict.fromkeys(spec.tasks, labels)
+    starts = [0, *(look.seeds for look in spec.looks[:-1])]
+    return [
+        unit
+        for look, start in enumerate(starts)
+        for unit in units_of(_at_look(spec, look, needed, start), size)
+    ]
+
+
 def round_units(found: Round) -> list[Unit]:
     """Returns the units that belong to what the next look needs, the trained ones included."""
     assert found.waiting is not None

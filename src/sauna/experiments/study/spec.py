@@ -25,9 +25,10 @@ most.
 from __future__ import annotations
 
 import json
+import os
 import string
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,6 +51,7 @@ from sauna.experiments.measure.measurement import (
 )
 from sauna.experiments.sequential import Look, capped
 from sauna.system.errors import BadInput, nearest
+from sauna.system.safe_read import JSON_BYTES, Untrusted, read_file
 
 _OWN = (*fields_with("decided_by_study"), "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
@@ -290,8 +292,11 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
         raise BadInput(f"study: {error}") from None
 
 
-def load_spec(name: str) -> Spec:
+def load_spec(name: str, check: Callable[[Mapping[str, Any]], None] = lambda text: None) -> Spec:
     """Loads a study of this package by name, or one in a TOML file.
+
+    Args:
+      check: refuses what a file says, before anything of it is imported.
 
     Raises:
       BadInput: there is no such study or file, or it cannot be read.
@@ -301,13 +306,14 @@ def load_spec(name: str) -> Spec:
     if current in known:  # under a former name it goes on in the folder of that name
         return read_spec({**tomllib.loads(known[current]), "name": name})
     path = Path(name)
-    if not path.is_file():
+    if not os.path.lexists(path):
         listed = ", ".join(known)
         raise BadInput(f"study: no study or file {name!r} (known: {listed}){nearest(name, known)}")
     try:
-        values = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        values = tomllib.loads(read_file(Path(os.path.realpath(path)), JSON_BYTES).decode())
+    except (Untrusted, ValueError, RecursionError) as error:
         raise BadInput(f"study: cannot read {path}: {error}") from error
+    check({"name": path.stem, **values})
     return read_spec({"name": path.stem, **values})
 
 

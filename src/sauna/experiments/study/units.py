@@ -52,7 +52,7 @@ class Unit(NamedTuple):
     def error(self, folder: Path) -> str | None:
         """Returns why it failed for good, or None."""
         path = folder / self.name / "failed.json"
-        return str(json.loads(path.read_text())["error"]) if path.is_file() else None
+        return str(run_directory.read_config_file(path).get("error")) if path.is_file() else None
 
     def is_complete(self, folder: Path) -> bool:
         return run_directory.is_complete(self.run(folder))

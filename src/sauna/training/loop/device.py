@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sauna.algorithm.policy.normalize import Moments
+from sauna.algorithm.policy.normalize import LongMoments, Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import Collected, Episode
+from sauna.algorithm.rollout.device import LARGEST
 from sauna.algorithm.types import Hypers, TrainState, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config, fields_with, to_json
@@ -184,7 +185,7 @@ def _check_sound(member: Member, iteration: int, report: Report) -> None:
         what = "reward" if report.faults.in_reward else "observation"
         raise EnvironmentFailure(
             f"environment {report.faults.env} of {member.name}, iteration {iteration}, step "
-            f"{report.faults.row} of the rollout: {what} is not finite"
+            f"{report.faults.row} of the rollout: {what} is not finite or beyond {LARGEST:g}"
         )
     check_finite(member, iteration, report.learned)
 
@@ -234,9 +235,10 @@ def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arra
     arrays |= named_optimizer(learner) | named_sampler(learner)
     arrays |= counters.to_arrays()
     moments = state.collect.observation_moments
-    if isinstance(moments, Moments):  # where a trained policy looks for them, and as the host's
-        for name, array in moments._asdict().items():
-            arrays[f"observation_moments/{name}"] = np.asarray(array, np.float64)
+    if isinstance(moments, LongMoments):  # where a trained policy looks for them, as the host's
+        for name in Moments._fields:
+            lost = np.asarray(getattr(moments, f"{name}_lost"), np.float64)
+            arrays[f"observation_moments/{name}"] = np.asarray(getattr(moments, name)) + lost
     arrays |= {f"collect/{name}": a for name, a in named_leaves(state.collect).items()}
     return {name: np.array(array) for name, array in arrays.items()}
 
@@ -265,6 +267,9 @@ def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(example)
     found = []
     for leaf, (name, place) in zip(leaves, named_leaves(example).items(), strict=True):
+        if name not in arrays and name.endswith("_lost"):  # of 0.1.0, which did not keep it
+            found.append(jnp.zeros(place.shape, place.dtype))
+            continue
         array = jnp.asarray(fitting(arrays, name, place))
         if _is_key(leaf):
             array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))

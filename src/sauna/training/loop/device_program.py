@@ -48,7 +48,7 @@ class MemberState(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What is told of one iteration of one member."""
+    """What is reported of one iteration of one member."""
 
     ran: Array  # [] bool; False: its budget was used up
     env_steps: Array  # [] int32 of this iteration
@@ -68,15 +68,15 @@ class IterationParts(NamedTuple):
     learning: Parts
 
 
-def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, anywhere: Any) -> IterationParts:
+def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, any_member: Any) -> IterationParts:
     """Builds the static parts of an iteration.
 
     Args:
       env: flat, of `spaces`.
-      anywhere: see `jax_env.advance`.
+      any_member: see `jax_env.advance`.
     """
     policy = make_policy(config, spaces)
-    collecting = Collecting(config, env, policy, make_filter(config), anywhere)
+    collecting = Collecting(config, env, policy, make_filter(config), any_member)
     return IterationParts(config, collecting, policy, make_parts(config, policy, spaces))
 
 
@@ -201,11 +201,11 @@ class Population:
         self._one_by_one = mesh is None and jax.default_backend() == "cpu"
         together = not self._one_by_one
 
-        def anywhere(here: Array) -> Array:
+        def any_member(here: Array) -> Array:
             """Over the members of one program: stays a scalar, so that a branch stays a branch."""
             return jax.lax.pmax(here.astype(jnp.int32), MEMBERS) > 0 if together else here
 
-        self.parts = parts = make_iteration(config, spaces, env, anywhere)
+        self.parts = parts = make_iteration(config, spaces, env, any_member)
         self.policy = parts.policy
         init = self.over_members(partial(init_member, parts))
         self._settings: Any = stack(settings) if together else settings
@@ -258,11 +258,11 @@ class Population:
             self._state, reports = self._run(self._state, self._settings, *span)
             reports = jax.device_get(reports)
             return [jax.tree.map(lambda x: x[:, p], reports) for p in range(self.number)]  # noqa: B023
-        told = []
+        reports = []
         for p in range(self.number):
             self._state[p], report = self._run(self._state[p], self._settings[p], *span)
-            told.append(jax.device_get(report))
-        return told
+            reports.append(jax.device_get(report))
+        return reports
 
     def states(self) -> list[MemberState]:
         """Every member's state, as numpy arrays (and JAX keys)."""

@@ -70,21 +70,27 @@ class Counters:
 
 def named_params(policy: Policy, params: jax.Array) -> dict[str, np.ndarray]:
     """The flat parameters as arrays named by their place in the network."""
-    leaves = jax.tree_util.tree_leaves_with_path(policy.unravel(params))
+    return {name: np.asarray(leaf) for name, leaf in _named(policy.unravel(params)).items()}
+
+
+def _named(tree: Any) -> dict[str, Any]:
     return {
-        "/".join(str(key.key) for key in path if key.key != "params"): np.asarray(leaf)
-        for path, leaf in leaves
+        "/".join(str(key.key) for key in path if key.key != "params"): leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
 
 
-def flat_params(policy: Policy, example: jax.Array, named: Mapping[str, np.ndarray]) -> jax.Array:
-    """The inverse of `named_params`; `example` is any parameter vector of the policy."""
-    tree = policy.unravel(example)
+def flat_params(policy: Policy, example: Any, named: Mapping[str, np.ndarray]) -> jax.Array:
+    """The inverse of `named_params`; `example` has the shape and type of a parameter vector.
+
+    Memory is taken for what is stored, not for what the policy would need.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    tree = jax.eval_shape(policy.unravel, example)
     structure = jax.tree_util.tree_structure(tree)
-    leaves = [
-        jnp.asarray(fitting(named, name, leaf))
-        for name, leaf in named_params(policy, example).items()
-    ]
+    leaves = [jnp.asarray(fitting(named, name, leaf)) for name, leaf in _named(tree).items()]
     return ravel_pytree(jax.tree_util.tree_unflatten(structure, leaves))[0]
 
 

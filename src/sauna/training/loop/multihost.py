@@ -34,7 +34,7 @@ def read_host_rank(text: str) -> HostRank:
     if not text:
         return SINGLE_HOST
     address, *numbers = text.split(",")
-    if len(numbers) != 2 or not all(n.isdigit() for n in numbers) or ":" not in address:
+    if len(numbers) != 2 or not all(n.isdecimal() for n in numbers) or ":" not in address:
         raise BadInput(f"distributed: {text!r} is not HOST:PORT,COUNT,INDEX")
     count, index = map(int, numbers)
     if not 0 <= index < count or count < 2:
@@ -111,7 +111,7 @@ def split_over_devices(members: int, envs: int, devices: int) -> tuple[int, int]
 
 
 def check_split(name: str, members: int, envs: int, devices: int) -> None:
-    """Refuses devices of which some would be idle.
+    """Refuses devices of which some would have no work.
 
     Raises:
       BadInput: the field `name` asked for them.

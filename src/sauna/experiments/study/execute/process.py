@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from sauna.system.safe_write import open_grown
+
 Message = dict[str, Any]
 
 
@@ -32,7 +34,7 @@ class UnitProcess:
         environment: Mapping[str, str] | None = None,
         module: str = "sauna.experiments.study.execute.unit_process",
     ) -> None:
-        with log.open("a") as file:
+        with open_grown(log) as file:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", module],
                 stdin=subprocess.PIPE,

@@ -45,7 +45,7 @@ def check(address: str) -> None:
     if address in ("", "auto"):
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    if not host or not port.isdigit():
+    if not host or not port.isdecimal():
         raise BadInput(f"address: {address!r} is neither HOST:PORT, ray://HOST:PORT nor auto")
     try:  # Ray itself would try for minutes
         socket.create_connection((host.strip("[]"), int(port)), timeout=5).close()

@@ -12,7 +12,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from sauna.system import run_directory
+from sauna.system import run_directory, safe_write
 
 LOGS = ("stderr.txt", *(f"run/{name}" for name in run_directory.LOGS))
 CHECKPOINTS = "run/checkpoints"
@@ -110,7 +110,7 @@ def _grow(path: Path, start: int, data: bytes) -> None:
     if start == 0:
         _replace_file(path, data)
     elif data:
-        with path.open("r+b") as file:
+        with safe_write.open_grown(path, "r+b") as file:
             file.truncate(start)
             file.seek(start)
             file.write(data)
@@ -120,10 +120,7 @@ def _grow(path: Path, start: int, data: bytes) -> None:
 
 def _replace_file(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.writing")
-    run_directory.write_durably(temporary, data)
-    temporary.replace(path)
-    run_directory.sync_folder(path.parent)
+    safe_write.replace_file(path, data)
 
 
 def _replace_folder(path: Path, files: dict[str, bytes]) -> None:
@@ -131,9 +128,9 @@ def _replace_folder(path: Path, files: dict[str, bytes]) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     for name, data in files.items():
-        run_directory.write_durably(temporary / name, data)
-    run_directory.sync_folder(temporary)
+        safe_write.write_durably(temporary / name, data)
+    safe_write.sync_folder(temporary)
     if path.exists():
         shutil.rmtree(path)
     temporary.rename(path)
-    run_directory.sync_folder(path.parent)
+    safe_write.sync_folder(path.parent)

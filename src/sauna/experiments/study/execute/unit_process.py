@@ -19,12 +19,14 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from pathlib import Path
 from typing import Any, TextIO
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.config.stored import to_stored
+from sauna.config.trust import covers
 from sauna.system import run_directory
 from sauna.system.errors import Interrupted, SaunaError
 from sauna.training import run as runs
@@ -82,7 +84,11 @@ def train(overrides: dict[str, Any], elsewhere: dict[str, Any], display: LineDis
     while True:
         resume = (path / "config.json").exists()
         try:
-            run = runs.reopen(path, {}, display) if resume else runs.start(overrides, display)
+            if resume:  # also where it was begun on another machine, for this study
+                trust = covers(overrides, run_directory.read_config(path))
+                run = runs.reopen(path, {}, display, trust)
+            else:
+                run = runs.start(overrides, display)
             break
         except (
             run_directory.InUse
@@ -116,6 +122,7 @@ def main() -> int:
     except Interrupted as error:
         return 128 + error.signal_number
     except SaunaError as error:
+        traceback.print_exception(error)
         display.send({"error": str(error)})
         return 1
     finally:

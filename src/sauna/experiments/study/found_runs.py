@@ -1,0 +1,46 @@
+"""The runs that a study finds: of the code that it names today, and with all their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sauna.config.code import changed_code, code_of
+from sauna.experiments.study.units import Unit, parts
+from sauna.system import run_directory
+from sauna.system.errors import BadInput
+from sauna.system.logs import damage_of
+
+
+def check_same_code(units: list[Unit], folder: Path, accept: bool) -> None:
+    """Refuses to take results of other code for those of today's.
+
+    Args:
+      accept: the user has said that they count as today's; the runs note both.
+
+    Raises:
+      BadInput: naming what changed.
+    """
+    for unit in (part for whole in units for part in parts(whole, folder)):
+        run = unit.run(folder)
+        if not (run / "config.json").is_file():
+            continue
+        stored = run_directory.read_config(run)
+        now = code_of(unit.settings)
+        changed = changed_code(stored.get("code", now), now)
+        if changed and not accept:
+            raise BadInput(
+                f"{run} was trained with other code: {changed}; --accept-changed-code takes such "
+                f"runs as they are, another --out trains them anew"
+            )
+        if changed:
+            run_directory.write_config(run, run_directory.with_code(stored, now))
+
+
+def reopen_damaged(units: list[Unit], folder: Path, say: Callable[[str], None]) -> None:
+    """Lets complete runs whose rows are not what was written be continued from before that."""
+    for unit in (part for whole in units for part in parts(whole, folder)):
+        run = unit.run(folder)
+        if unit.is_complete(folder) and (damage := damage_of(run)):
+            say(f"warning: {damage}; the run is continued from before that")
+            (run / "summary.json").unlink()

@@ -1,0 +1,327 @@
+"""Each sampler against float64 numpy, and with its numbers changed: the difference is noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from algorithm.selection import oracle
+from sauna.algorithm.policy.distributions import bernoulli, gaussian, multi_categorical
+from sauna.algorithm.selection.gigaflow import gigaflow
+from sauna.algorithm.selection.gradient_norm import gradient_norm, head_gradient
+from sauna.algorithm.selection.kondo import kondo
+from sauna.algorithm.selection.pods import pods, widest
+from sauna.algorithm.selection.positive import cut_at_zero, positive
+from sauna.algorithm.selection.prioritized import prioritized
+from sauna.algorithm.selection.scores import count_of
+from sauna.algorithm.selection.top_advantage import top_advantage
+from sauna.algorithm.selection.vex_oracle import vex_oracle
+from sauna.algorithm.types import Sampler, Samples
+from selections import (
+    DISCRETE,
+    ENVS,
+    ROWS,
+    SETUP,
+    STEPS,
+    chosen,
+    of_present,
+    random_samples,
+    spread,
+)
+
+SEEDS = range(3)
+Found = dict[str, np.ndarray]
+
+
+def largest_of(samples: Samples, score: np.ndarray, share: float) -> np.ndarray:
+    """The count is that of all slots: a rollout with empty ones gives up no more rows."""
+    return spread(samples, oracle.largest(score, oracle.kept_count(share, ROWS)))
+
+
+def expected_top(s: Samples) -> Found:
+    (advantage,) = of_present(s, "advantage")
+    return {"keep": largest_of(s, np.abs(advantage), 0.5)}
+
+
+def expected_positive(s: Samples) -> Found:
+    return {"keep": spread(s, oracle.positive_keep(of_present(s, "advantage")[0]))}
+
+
+def expected_kondo(s: Samples) -> Found:
+    advantage, log_prob, entropy = of_present(s, "standardized", "log_prob", "entropy")
+    chi = advantage * oracle.surprisal(log_prob, entropy)
+    return {"keep": largest_of(s, chi, 0.3)}
+
+
+def expected_pods(s: Samples) -> Found:
+    advantage = np.asarray(s.advantage, np.float64) * np.asarray(s.present)
+    kept = oracle.pods_keep(oracle.segment_scores(advantage.reshape(STEPS, ENVS), 6))
+    rows = oracle.segments_to_rows(kept, STEPS, 6).ravel()
+    return {"keep": rows & np.asarray(s.present)}
+
+
+def expected_vex(s: Samples, which: Any = "high") -> Found:
+    share = oracle.vex_share(*of_present(s, "error", "return_"))
+    count = oracle.kept_count(0.5, ROWS)
+    return {"keep": spread(s, oracle.vex_keep(share, count / len(share), which))}
+
+
+def expected_prioritized(s: Samples, correction: float = 0.2) -> Found:
+    p = oracle.prioritized_probabilities(of_present(s, "advantage")[0])
+    weight = oracle.prioritized_weights(p, correction)
+    return {"probability": spread(s, p), "weight": spread(s, weight)}
+
+
+def expected_gradient_norm(s: Samples, head: np.ndarray) -> Found:
+    p = oracle.mixed_probabilities(head)
+    value_p = oracle.mixed_probabilities(np.abs(of_present(s, "error")[0]))
+    return {
+        "probability": spread(s, p),
+        "weight": spread(s, oracle.importance_weights(p)),
+        "value_probability": spread(s, value_p),
+        "value_weight": spread(s, oracle.importance_weights(value_p)),
+    }
+
+
+def expected_gaussian(s: Samples) -> Found:
+    names = ("standardized", "action", "policy", "hidden")
+    advantage, action, policy, hidden = of_present(s, *names)
+    mean, log_std = np.split(policy, 2, -1)
+    head = oracle.gaussian_gradient_norm(advantage, action, mean, np.exp(log_std), hidden)
+    return expected_gradient_norm(s, head)
+
+
+def expected_categorical(s: Samples) -> Found:
+    names = ("standardized", "action", "policy", "hidden")
+    advantage, action, policy, hidden = of_present(s, *names)
+    pi = np.exp(policy - policy.max(-1, keepdims=True))
+    pi /= pi.sum(-1, keepdims=True)
+    head = oracle.categorical_gradient_norm(advantage, action[:, 0], pi, hidden)
+    return expected_gradient_norm(s, head)
+
+
+class Case:
+    """A rule with its own numbers, what it has to give, and other numbers, which give another."""
+
+    def __init__(
+        self,
+        rule: Callable[..., Sampler],
+        expected: Callable[[Samples], Found],
+        *other: dict[str, Any],
+        setup: Any = SETUP,
+        **numbers: Any,
+    ) -> None:
+        self.rule, self.expected, self.other = rule, expected, other
+        self.setup, self.numbers = setup, numbers
+
+    def agrees(self, seed: int, **numbers: Any) -> bool:
+        samples = random_samples(seed, setup=self.setup)
+        choice = chosen(self.rule(self.setup, **{**self.numbers, **numbers}), samples)
+        return all(
+            np.allclose(getattr(choice, name), wanted, rtol=2e-5, atol=1e-7)
+            for name, wanted in self.expected(samples).items()
+        )
+
+
+CASES = {
+    "top-advantage": Case(top_advantage, expected_top, {"share": 0.6}, {"leak": 0.5}),
+    "kondo": Case(kondo, expected_kondo, {"share": 0.35}, {"centred": False}),
+    "pods": Case(pods, expected_pods, {"share": 0.4}, {"length": 5}, length=6),
+    "vex-high": Case(vex_oracle, expected_vex, {"share": 0.4}, {"keep": "low"}),
+    "vex-low": Case(vex_oracle, lambda s: expected_vex(s, "low"), {"keep": "both"}, keep="low"),
+    "vex-both": Case(vex_oracle, lambda s: expected_vex(s, "both"), {"keep": "high"}, keep="both"),
+    "prioritized": Case(prioritized, expected_prioritized, {"power": 0.7}, {"correction": 0.3}),
+    "gradient-norm": Case(gradient_norm, expected_gaussian, {"uniform": 0.2}),
+    "gradient-norm-discrete": Case(
+        gradient_norm, expected_categorical, {"uniform": 0.2}, setup=DISCRETE
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_rule_takes_what_numpy_says_and_its_numbers_matter(name: str) -> None:
+    case = CASES[name]
+    assert all(case.agrees(seed) for seed in SEEDS)
+    for other in case.other:
+        assert not all(case.agrees(seed, **other) for seed in SEEDS), other
+
+
+def test_gigaflow_follows_the_largest_advantage_over_rollouts() -> None:
+    """Its last rollout is so small that M outlives it: nothing is kept."""
+
+    def agrees(sampler: Sampler) -> bool:
+        state, maximum, same = sampler.init(), None, True
+        for seed, scale in enumerate((1.0, 0.1, 3.0, 1e-4)):
+            s = random_samples(seed)
+            s = s._replace(advantage=s.advantage * scale)
+            keep, maximum = oracle.gigaflow_keep(of_present(s, "advantage")[0], maximum)
+            state, choice = sampler.choose(state, s, jax.random.key(0))
+            same &= np.array_equal(choice.keep, spread(s, keep))
+            same &= np.allclose(state, maximum, rtol=1e-6)
+        assert not keep.any()
+        return same
+
+    assert agrees(gigaflow(SETUP))
+    assert not agrees(gigaflow(SETUP, rate=0.3))
+    assert not agrees(gigaflow(SETUP, threshold=0.02))
+
+
+def test_positive_keeps_what_went_better_than_expected() -> None:
+    for seed in SEEDS:
+        s = random_samples(seed)
+        keep = chosen(positive(SETUP), s).keep
+        np.testing.assert_array_equal(keep, expected_positive(s)["keep"])
+        lower = s._replace(advantage=s.advantage - 0.1)
+        assert not np.array_equal(keep, expected_positive(lower)["keep"])
+
+
+def test_advantages_cut_at_zero_are_scaled_and_not_centred() -> None:
+    s = random_samples(0)
+    weight = jnp.asarray(s.present, jnp.float32)
+    cut = np.asarray(cut_at_zero(s.advantage, weight))
+    advantage = of_present(s, "advantage")[0]
+    expected = oracle.positive_advantage(advantage)
+    np.testing.assert_allclose(cut[np.asarray(s.present)], expected, rtol=1e-5)
+    centred = oracle.positive_advantage(advantage - advantage.mean())
+    assert not np.allclose(cut[np.asarray(s.present)], centred, rtol=1e-2)
+
+
+def test_the_correction_rises_to_one_over_the_budget() -> None:
+    s, sampler = random_samples(1), prioritized(SETUP)
+    for count, correction in ((0, 0.2), (2, 0.6), (4, 1.0), (9, 1.0)):
+        state, choice = sampler.choose(jnp.int32(count), s, jax.random.key(0))
+        expected = expected_prioritized(s, correction)["weight"]
+        np.testing.assert_allclose(choice.weight, expected, rtol=1e-5)
+        assert state == count + 1
+    assert not np.allclose(choice.weight, expected_prioritized(s, 0.9)["weight"], rtol=1e-3)
+
+
+def test_where_scores_tie_the_lower_rows_are_kept() -> None:
+    s = random_samples(0, absent=0.0)
+    s = s._replace(advantage=jnp.asarray(np.arange(ROWS) % 3, jnp.float32))
+    keep = chosen(top_advantage(SETUP, share=0.5), s).keep
+    np.testing.assert_array_equal(keep, oracle.top_advantage_keep(s.advantage, 0.5))
+
+
+def test_a_share_of_the_others_leaks() -> None:
+    rows = 4000
+    setup = SETUP._replace(rollout_steps=rows, envs=1)
+    s = random_samples(3, rows=rows)
+    top = chosen(top_advantage(setup, share=0.25), s).keep
+    others = np.asarray(s.present) & ~top
+    leaked = chosen(top_advantage(setup, share=0.25, leak=0.3), s).keep
+    assert leaked[top].all() and not leaked[~np.asarray(s.present)].any()
+    number = others.sum()
+    assert abs(leaked[others].sum() - 0.3 * number) < 5 * np.sqrt(number * 0.3 * 0.7)
+    everything = chosen(top_advantage(setup, share=0.25, leak=1.0), s).keep
+    np.testing.assert_array_equal(everything, s.present)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_other_set_of_segments_varies_more(seed: int) -> None:
+    score = np.random.default_rng(seed).normal(size=8).astype(np.float32)
+    kept = np.asarray(widest(jnp.asarray(score), 4))
+    assert kept.sum() == 4
+    np.testing.assert_allclose(score[kept].var(), oracle.largest_variance(score, 4), rtol=1e-5)
+    assert score[:4].var() < score[kept].var()
+
+
+@pytest.mark.parametrize(
+    "kind, sizes, distribution",
+    [
+        ("continuous", (2,), gaussian(2)),
+        ("discrete", (3,), multi_categorical((3,))),
+        ("multi_discrete", (3, 2), multi_categorical((3, 2))),
+        ("multi_binary", (3,), bernoulli(3)),
+    ],
+)
+def test_the_bound_is_the_gradients_norm_at_the_head(kind, sizes, distribution) -> None:
+    """By automatic differentiation of one row's log-probability over W, b and the log-std."""
+    rng = np.random.default_rng(2)
+    rows, width, hidden = 6, distribution.num_outputs, 4
+    w, b, log_std = (rng.normal(size=s) for s in ((hidden, width), width, width))
+    h = rng.normal(size=(rows, hidden))
+
+    def parameters(w: Any, b: Any, log_std: Any, h: Any) -> Any:
+        head = h @ w + b
+        return jnp.concatenate([head, log_std]) if kind == "continuous" else head
+
+    policy = jnp.stack([parameters(w, b, log_std, x) for x in h])
+    noise = distribution.draw(jax.random.key(0), (rows,))
+    action = distribution.sample(policy, noise)
+    got = head_gradient(
+        SETUP._replace(action_kind=kind, action_sizes=sizes), policy, action, jnp.asarray(h)
+    )
+
+    def log_prob(w: Any, b: Any, log_std: Any, h: Any, action: Any) -> Any:
+        return distribution.log_prob(parameters(w, b, log_std, h), action)
+
+    of_row = jax.grad(log_prob, argnums=(0, 1, 2))
+    of_rows = jax.jit(jax.vmap(of_row, in_axes=(None, None, None, 0, 0)))
+    gradient = of_rows(*map(jnp.asarray, (w, b, log_std, h, action)))
+    squares = (np.sum(np.asarray(x).reshape(rows, -1) ** 2, -1) for x in gradient)
+    np.testing.assert_allclose(got, np.sqrt(sum(squares)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("rule", [gradient_norm, prioritized])
+def test_weights_of_a_draw_undo_its_probabilities(rule: Callable[..., Sampler]) -> None:
+    """Summed over every row that can be drawn, the weighted mean is the mean of all rows.
+
+    At the end of the budget prioritized is proportional to that; before it is not.
+    """
+    s, state = random_samples(5), None
+    term = np.random.default_rng(0).normal(size=ROWS)
+    on = np.asarray(s.present)
+    if rule is prioritized:
+        state = jnp.int32(SETUP.iterations - 1)
+    choice = chosen(rule(SETUP), s, state)
+    weight = choice.weight / np.sum(choice.probability * choice.weight)
+    np.testing.assert_allclose(np.sum(choice.probability), 1.0, rtol=1e-5)
+    mean = np.sum(choice.probability * weight * term)
+    np.testing.assert_allclose(mean, term[on].mean(), rtol=1e-4)
+    unweighted = np.sum(choice.probability * term)
+    assert abs(unweighted - term[on].mean()) > 0.01
+    if rule is gradient_norm:
+        np.testing.assert_allclose(np.sum(choice.probability * choice.weight), 1.0, rtol=1e-5)
+        value = np.sum(choice.value_probability * choice.value_weight * term)
+        np.testing.assert_allclose(value, term[on].mean(), rtol=1e-4)
+
+
+def test_rows_without_a_gradient_are_drawn_evenly() -> None:
+    s = random_samples(1)
+    s = s._replace(standardized=jnp.zeros(ROWS), error=jnp.zeros(ROWS))
+    choice = chosen(gradient_norm(SETUP), s)
+    even = np.asarray(s.present) / np.asarray(s.present).sum()
+    np.testing.assert_allclose(choice.probability, even, rtol=1e-6)
+    np.testing.assert_allclose(choice.value_probability, even, rtol=1e-6)
+
+
+def test_counts_round_up_and_not_for_a_last_bit() -> None:
+    assert [count_of(share, 60) for share in (0.1, 0.101, 1e-9, 1.0)] == [6, 7, 1, 60]
+    assert all(count_of(k / 100, 100) == k for k in range(1, 101))
+
+
+@pytest.mark.parametrize(
+    "rule, numbers, text",
+    [
+        (gigaflow, {"threshold": -1.0}, "threshold must be a number at least 0"),
+        (gigaflow, {"rate": "a"}, "rate must be a number between 0 and 1"),
+        (top_advantage, {"share": 0}, "share must be above 0"),
+        (top_advantage, {"share": 1.5}, "share must be a number between 0 and 1"),
+        (top_advantage, {"leak": True}, "leak must be a number"),
+        (prioritized, {"correction": 2}, "correction must be a number between 0 and 1"),
+        (gradient_norm, {"uniform": -0.1}, "uniform must be a number"),
+        (kondo, {"share": float("nan")}, "share must be a number"),
+        (pods, {"length": 0}, "length must be a number at least 1"),
+        (pods, {"length": 1.5}, "length must be a whole number"),
+        (vex_oracle, {"keep": "top"}, "keep must be one of high, low, both, not 'top'"),
+    ],
+)
+def test_numbers_that_make_no_rule_are_refused(rule, numbers, text) -> None:
+    with pytest.raises(ValueError, match=text):
+        rule(SETUP, **numbers)

@@ -1,0 +1,221 @@
+"""Rules of a user's own: they are traced before a run, and they train."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sauna
+from helpers import SMALL, configured, environment
+from sauna.algorithm.selection.registry import make_filter
+from sauna.config.presets import ARMS, arm_settings, resolve
+from sauna.config.settings import Config
+from sauna.envs.spaces import Spaces
+from sauna.system.errors import BadInput
+from sauna.training.check_plugins import check_plugins
+
+SPACES = Spaces("vector", (3,), "continuous", (2,), "", "")
+BITS = Spaces("vector", (3,), "multi_binary", (2,), "", "")
+
+
+def of(**settings: Any) -> Config:
+    start = {"arm": "ppo", "rollout_steps": 16, "minibatches": 4, "hidden": "4", "steps": 64}
+    return configured(**{**start, **settings})
+
+
+@pytest.mark.parametrize("spaces", [SPACES, BITS])
+def test_rules_that_fit_are_taken(spaces: Spaces) -> None:
+    for settings in (
+        {"arm": "sauna", "filter": "own_rules:likely"},
+        {"arm": "sauna", "filter": "own_rules:likely", "filter_kwargs": '{"least": -2}'},
+        {"sampler": "own_rules:newest", "sampler_kwargs": '{"share": 0.25}'},
+        {"sampler": "own_rules:newest", "control": "reversed"},
+        {"sampler": "own_rules:scoreless", "control": "stride"},
+        {"loss_weight": "own_rules:softened", "loss_weight_kwargs": '{"power": 2}'},
+        {"stop": "own_rules:far", "stop_kwargs": '{"limit": 0.1}'},
+    ):
+        check_plugins(of(**settings), spaces)
+
+
+REFUSED = [
+    (
+        {"arm": "sauna", "filter": "own_rules:likely", "filter_kwargs": '{"most": -2}'},
+        "filter_kwargs: own_rules:likely cannot be made: likely() got an unexpected",
+    ),
+    ({"arm": "sauna", "filter": "own_rules:far"}, "filter: own_rules:far is not a sauna.StepF"),
+    ({"sampler": "own_rules:no_rule"}, "sampler: own_rules:no_rule is not a sauna.Sampler"),
+    ({"sampler": "own_rules:too_short"}, "keep of shape (15,) and type bool instead of (16,)"),
+    ({"sampler": "own_rules:by_number"}, "and type float32 instead of (16,) and bool"),
+    ({"sampler": "own_rules:both"}, "not exactly one: keep or probability"),
+    ({"sampler": "own_rules:neither"}, "not exactly one: keep or probability"),
+    ({"sampler": "own_rules:mask_alone"}, "instead of a sauna.Choice"),
+    ({"sampler": "own_rules:unpaired"}, "no pair of a state and a choice"),
+    ({"sampler": "own_rules:misspelt"}, "has no attribute 'advantages'"),
+    ({"sampler": "own_rules:growing"}, "a state of other arrays than it began with"),
+    ({"sampler": "own_rules:of_nothing"}, "has share 0.0, which is not in (0, 1]"),
+    ({"sampler": "own_rules:scoreless", "control": "reversed"}, "whose choice has a score"),
+    (
+        {"sampler": "own_rules:scoreless", "sampler_kwargs": '{"share": 0.5}'},
+        "sampler_kwargs: own_rules:scoreless is a rule already and takes none",
+    ),
+    (
+        {"sampler": "own_rules:newest", "sampler_kwargs": '{"sare": 0.5}'},
+        "sampler_kwargs: own_rules:newest cannot be made: newest() got an unexpected",
+    ),
+    ({"loss_weight": "own_rules:single"}, "no pair of a mask and a scale"),
+    ({"loss_weight": "own_rules:summed"}, "scale of shape () and type float32 instead of (4,)"),
+    ({"loss_weight": "own_rules:far"}, "loss_weight: own_rules:far is not a sauna.LossWeight"),
+    ({"stop": "own_rules:each"}, "an answer of shape (4,) and type bool instead of ()"),
+    ({"stop": "own_rules:amount"}, "type float32 instead of () and bool"),
+    ({"stop": "own_rules:nothere"}, "has no 'nothere'"),
+    ({"sampler": "kondo", "sampler_kwargs": '{"share": 7}'}, "share must be a number between"),
+    ({"sampler": "pods", "sampler_kwargs": '{"size": 7}'}, "unexpected keyword argument 'size'"),
+    ({"stop": "espo", "stop_kwargs": '{"limit": "x"}'}, "limit must be a number at least 0"),
+    ({"loss_weight": "delight", "loss_weight_kwargs": '{"on": "x"}'}, "on must be one of mean"),
+]
+
+
+@pytest.mark.parametrize("settings, text", REFUSED)
+def test_a_mistake_is_one_line_before_the_run(settings: dict[str, Any], text: str) -> None:
+    with pytest.raises(BadInput) as found:
+        check_plugins(of(**settings), SPACES)
+    assert text in str(found.value) and "\n" not in str(found.value)
+
+
+def test_a_mistake_ends_with_2_and_creates_nothing(tmp_path) -> None:
+    settings = {"arm": "ppo", "rollout-steps": 16, "minibatches": 4, "steps": 64}
+    command = ["worlds:Scripted", *(f"--{name}={value}" for name, value in settings.items())]
+    mistakes = (
+        ["--sampler", "own_rules:too_short"],
+        ["--sampler", "kondo", "--sampler-kwargs", '{"share": 7}'],
+    )
+    for mistake in mistakes:
+        run = subprocess.run(
+            [sys.executable, "-m", "sauna", "train", *command, *mistake, "--out", "run"],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+        )
+        assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_rules_train_by_name_and_by_value(tmp_path) -> None:
+    """A quarter of the rows: minibatches of 2. The sampler's state is a Python number."""
+    settings = {**SMALL, "arm": "ppo", "steps": 64, "selection_mode": "smaller"}
+    found = sauna.train(
+        "worlds:Scripted",
+        out=tmp_path / "one",
+        quiet=True,
+        sampler="own_rules:newest",
+        sampler_kwargs={"share": 0.25},
+        loss_weight="own_rules:softened",
+        stop="own_rules:far",
+        stop_kwargs={"limit": 1e9},
+        **settings,
+    )
+    for row in found.metrics:
+        assert row["sample_rate"] == 0.25 and row["gradient_steps"] == 8
+        assert row["samples_backward"] == 16 and row["samples_forward"] == 16 + 32
+    import own_rules
+
+    again = sauna.train(
+        "worlds:Scripted",
+        out=tmp_path / "two",
+        quiet=True,
+        sampler=own_rules.newest,
+        sampler_kwargs={"share": 0.25},
+        loss_weight=own_rules.softened,
+        stop=own_rules.far,
+        stop_kwargs={"limit": 1e9},
+        **settings,
+    )
+    assert [row["policy_loss"] for row in again.metrics] == [
+        row["policy_loss"] for row in found.metrics
+    ]
+
+
+def test_everything_a_rule_is_written_with_is_public() -> None:
+    for name in sauna.__all__:
+        assert getattr(sauna, name).__name__ == name
+    assert {"Sampler", "Samples", "Choice", "StepFilter", "ScoredStep"} <= set(sauna.__all__)
+
+
+MISTAKEN = [
+    ({"control": "random"}, "control: needs a rule to follow"),
+    ({"sampler": "pods", "loss_weight": "delight", "control": "random"}, "are two rules"),
+    ({"loss_weight": "delight", "control": "stride"}, "controlled by random or reversed"),
+    ({"arm": "random-drop", "drop_rate": 0.5, "control": "stride"}, "is a control itself"),
+    ({"arm": "sauna-reference", "control": "random"}, "control: needs gae_over=all"),
+    ({"arm": "sauna-reference", "critic": "avec"}, "critic: needs gae_over=all"),
+    (
+        {"arm": "sauna-reference", "recompute_advantages": True},
+        "recompute_advantages: needs gae_over=all",
+    ),
+    ({"objective": "unclipped"}, "unclipped needs a stop rule"),
+    ({"algorithm": "a2c", "stop": "espo"}, "stop: not read"),
+    ({"sampler_kwargs": "{}"}, "sampler_kwargs: not read"),
+    ({"arm": "sauna", "filter_kwargs": "{}"}, "needs a filter of your own"),
+    ({"arm": "random"}, "follows a rule; join it to one"),
+    ({"arm": "ppo,gigaflow"}, "gigaflow differs from the other arms in"),
+    ({"arm": "sauna,sauna+avec"}, "sauna+avec differs from the other arms in"),
+    ({"arm": "gigaflow+random+avec+spo+pods"}, "joins sampler gigaflow and sampler pods"),
+    ({"arm": "gigaflow+pods"}, "joins sampler gigaflow and sampler pods"),
+    ({"arm": "gigafow"}, "did you mean 'gigaflow'"),
+    ({"sampler": "kondu"}, "did you mean 'kondo'"),
+    ({"arm": "pods", "sampler_kwargs": '{"share": Infinity}'}, "JSON has no infinity"),
+]
+
+
+@pytest.mark.parametrize("settings, text", MISTAKEN)
+def test_rules_that_cannot_work_together_are_refused(settings: dict[str, Any], text: str) -> None:
+    with pytest.raises(BadInput) as found:
+        resolve({"env": "worlds:Scripted", "arm": "ppo", **settings})
+    assert text in str(found.value)
+
+
+def test_joined_rules_are_those_of_each_part() -> None:
+    """In any order, but a control follows what it is joined to; each part changes ppo."""
+    both = arm_settings("sauna+avec")
+    assert both == {**ARMS["sauna"], "critic": "avec", "clip_value": False}
+    turned = arm_settings("avec+sauna")
+    assert {name: turned[name] for name in both} == both
+    assert arm_settings("gigaflow+random") == {**ARMS["gigaflow"], "control": "random"}
+    resolved = resolve({"env": "worlds:Scripted", "arm": "gigaflow+stride"})
+    assert (resolved.sampler, resolved.control, resolved.filter) == ("gigaflow", "stride", "none")
+
+
+def test_an_own_filters_arguments_matter() -> None:
+    """A step of log-probability -2.5 is kept or dropped."""
+    settings = {"arm": "sauna", "filter": "own_rules:likely"}
+    zero = np.zeros(1, np.float32)
+    step = sauna.ScoredStep(zero, zero, np.full(1, -2.5, np.float32), zero, zero)
+    for least, kept in ((-3.0, True), (-2.0, False)):
+        own = make_filter(of(**settings, filter_kwargs={"least": least}))
+        assert own is not None and own.keep((), step, None, None)[1].tolist() == [kept]  # type: ignore[arg-type]
+
+
+OFF = {
+    "sampler": "none",
+    "control": "none",
+    "normalize_over": "minibatch",
+    "advantage_sign": "both",
+    "objective": "clip",
+    "loss_weight": "none",
+    "stop": "none",
+    "critic": "squared",
+    "recompute_advantages": False,
+    "auxiliary": "none",
+}
+
+
+def test_a_hook_that_is_off_is_the_same_config_as_none_given() -> None:
+    """So the same program, and the same bits; `six_runs.py` holds them to those of before."""
+    plain = {"env": "worlds:Scripted", "arm": "sauna,vex-head"}
+    assert resolve({**plain, **OFF}) == resolve(plain)
+    assert np.all([getattr(Config(), name) == value for name, value in OFF.items()])

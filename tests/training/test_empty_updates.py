@@ -1,0 +1,49 @@
+"""A rule that keeps nothing is named at once, and ends the run if it goes on."""
+
+from __future__ import annotations
+
+import pytest
+
+import sauna
+from helpers import SMALL
+from sauna.system.errors import BadInput, SaunaError
+from sauna.training.empty_updates import MAX_EMPTY, EmptyUpdates
+
+
+def row(keep_rate: float, steps: int = 4, iteration: int = 0) -> dict[str, object]:
+    return {
+        "member": "sauna/0",
+        "keep_rate": keep_rate,
+        "gradient_steps": steps,
+        "iteration": iteration,
+    }
+
+
+def test_one_warning_and_an_end_after_ten_in_a_row() -> None:
+    updates = EmptyUpdates()
+    assert updates.see([row(0.5)]) == []
+    assert "kept no sample of iteration 3" in updates.see([row(0.0, iteration=3)])[0]
+    assert updates.see([row(0.5, steps=0)]) == []
+    updates.see([row(0.5)])  # a row that learns begins the count anew
+    for _ in range(MAX_EMPTY - 1):
+        assert updates.see([row(0.0)]) == []
+    with pytest.raises(SaunaError, match="in 10 iterations in a row"):
+        updates.see([row(0.0)])
+
+
+def test_a_run_that_learns_nothing_fails(tmp_path, capsys) -> None:
+    settings = {**SMALL, "steps": 32 * 12, "threshold": 1e30, "dropped": "mask"}
+    with pytest.raises(SaunaError, match="kept no sample in 10 iterations"):
+        sauna.train(
+            "worlds:Scripted",
+            arm="sauna",
+            filter="own_rules:nothing",
+            out=tmp_path / "r",
+            **settings,
+        )
+    assert "warning: sauna/0: the rule kept no sample of iteration 0" in capsys.readouterr().out
+
+
+def test_a_minibatch_of_one_sample_is_refused() -> None:
+    with pytest.raises(BadInput, match="minibatches: 32 of 32 samples leave 1 each"):
+        sauna.train("worlds:Scripted", **{**SMALL, "minibatches": 32})
