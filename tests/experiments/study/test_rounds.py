@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers import SMALL
+from sauna.api import compare
 from sauna.experiments.sequential import DESIGN, capped, replay, tournament
 from sauna.experiments.study.command import (
     chosen_arms,
@@ -32,6 +34,7 @@ def spec_of(*rules: str, **settings: Any) -> Spec:
     return comparison("A-v0", arms, settings, is_tournament)
 
 
+QUICK = {key: value for key, value in SMALL.items() if key not in ("seeds", "steps")}
 _DEFAULT = ("ppo", "vex-head", "random-drop", "sauna")
 
 
@@ -53,6 +56,7 @@ def train(unit: Unit, folder: Path) -> None:
             rows.append(
                 {
                     "member": name,
+                    "arm": unit.label,
                     "seed": seed,
                     "iteration": iteration,
                     "env_steps": 100 * (iteration + 1),
@@ -184,7 +188,11 @@ def test_compute_is_carried_from_the_runs_to_the_verdict(tmp_path: Path) -> None
     row = {row["label"]: row for row in summary["table"]}
     assert row["gigaflow"]["samples_backward"] == 150.0
     assert row["ppo"]["samples_backward"] == 300.0
-    assert row["ppo"]["learner_cpu_seconds"] == 6.0
+    cells = json.loads((place / "results.json").read_text())["cells"]
+    member = {cell["label"]: cell["members"][0] for cell in cells}["ppo"]
+    assert (member["samples_backward"], member["learner_cpu_seconds"]) == (300.0, 6.0)
+    assert member["curve"]["samples_backward"] == [100.0, 200.0, 300.0]
+    assert member["curve"]["learner_cpu_seconds"] == [2.0, 4.0, 6.0]
     found = {v["label"]: v for v in summary["equal_compute"]}
     # Both means rise in a straight line: from a third to all of 207 (ppo) and of 307 (gigaflow).
     mean = 200 + np.mean([(seed * 7) % 16 for seed in range(3)])
@@ -269,3 +277,17 @@ def test_arms_and_rules_on_the_command_line() -> None:
         chosen_arms(("ppo", "pods"), ("spo",), True, {})
     command = compare_command("A-v0", _DEFAULT, {}, "runs", ("spo", "espo"), False)
     assert command == "sauna compare A-v0 --rules spo,espo --no-controls"
+
+
+@pytest.mark.slow
+def test_a_tournament_is_trained_and_run_again_trains_nothing(tmp_path: Path) -> None:
+    settings = {"seeds": 4, "steps": 128, **QUICK}
+    out, rules = tmp_path / "runs", ("gigaflow",)
+    summary = compare("CartPole-v1", rules=rules, out=out, quiet=True, **settings)
+    assert [row["label"] for row in summary["table"]] == ["ppo", "gigaflow", "gigaflow+random"]
+    (row,) = summary["ranking"]
+    assert row["verdict"] in ("not decided", "better", "worse")
+    assert {row["seeds"] for row in summary["table"]} == {row["seeds"]} <= {3, 4}
+    before = {path: path.stat().st_mtime_ns for path in (out / "units").rglob("metrics.jsonl")}
+    assert compare("CartPole-v1", rules=rules, out=out, quiet=True, **settings) == summary
+    assert before == {p: p.stat().st_mtime_ns for p in (out / "units").rglob("metrics.jsonl")}

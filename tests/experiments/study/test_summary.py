@@ -35,7 +35,6 @@ ROW = {
     "env_steps",
     "kept_steps",
     "samples_backward",
-    "learner_cpu_seconds",
     "improvement",
 }
 

@@ -29,6 +29,7 @@ UNREAD: dict[str, Any] = {
     "address": "",
     "rules": "",
     "controls": True,
+    "accept_changed_code": False,
 }
 LAST = 0.1  # share of the compared env steps whose mean return is the final return
 

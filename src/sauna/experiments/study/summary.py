@@ -152,7 +152,6 @@ def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
         "env_steps": cell.mean("env_steps"),
         "kept_steps": cell.mean("kept_steps"),
         "samples_backward": cell.mean("samples_backward"),
-        "learner_cpu_seconds": cell.mean("learner_cpu_seconds"),
         "improvement": list(comparison.improvement) if comparison else None,
     }
 
