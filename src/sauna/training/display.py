@@ -49,7 +49,7 @@ class _Progress:
     """Latest row of each member, and the rate since training began."""
 
     def __init__(self, config: Config, members: list[Member], rows: list[dict[str, Any]]) -> None:
-        self.config = config
+        self.config, self.members = config, members
         self.latest: dict[str, dict[str, Any] | None] = {m.name: None for m in members}
         self.phases: dict[int, str] = {}
         self.seconds_left: float | None = None
@@ -189,18 +189,11 @@ class LiveDisplay:
         assert self._progress is not None
         table = Table(title=self._progress.status(), title_justify="left", box=None)
         table.add_column("member")
-        for column in ("env steps", "episodes", "return", "keep rate", "Vex mean", "Vex spread"):
-            table.add_column(column, justify="right")
+        columns = columns_of(self._progress.members)
+        for title, _, _ in columns:
+            table.add_column(title, justify="right")
         for name, row in self._progress.latest.items():
-            table.add_row(
-                name,
-                number(row, "env_steps", ",d"),
-                number(row, "episodes", ",d"),
-                number(row, "return_mean", ".1f"),
-                number(row, "keep_rate", ".3f"),
-                number(row, "vex_mean", ".3f"),
-                number(row, "vex_spread", ".3f"),
-            )
+            table.add_row(name, *(number(row, key, form) for _, key, form in columns))
         return table
 
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
@@ -212,6 +205,30 @@ class LiveDisplay:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
+    """The live table's columns: title, key in a row, format.
+
+    What only a rule or a Vex head has is shown if a member has one.
+    """
+    columns = [
+        ("env steps", "env_steps", ",d"),
+        ("episodes", "episodes", ",d"),
+        ("return", "return_mean", ".1f"),
+        ("length", "episode_length_mean", ".0f"),
+        ("entropy", "entropy", ".2f"),
+        ("KL", "kl", ".4f"),
+        ("expl. var.", "explained_variance", ".2f"),
+    ]
+    configs = [member.config for member in members]
+    if any(config.filter != "none" for config in configs):
+        columns.append(("keep rate", "keep_rate", ".3f"))
+    if any(config.sampler != "none" for config in configs):
+        columns.append(("sample rate", "sample_rate", ".3f"))
+    if any(config.vex_coef > 0 for config in configs):
+        columns += [("Vex mean", "vex_mean", ".3f"), ("Vex spread", "vex_spread", ".3f")]
+    return columns
 
 
 def headline(config: Config, members: list[Member], path: Path) -> str:

@@ -105,6 +105,9 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
                 )
         there = np.asarray(ends.there)
         assert int(ends.number) == there.sum() == len(told.episodes) > 0
+        np.testing.assert_allclose(ends.return_mean, told.return_mean, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(ends.length_mean, told.length_mean, rtol=1e-5)
+        assert np.isclose(told.length_mean, np.mean([e.length for e in told.episodes]))
         assert not faults.found
         for i, episode in zip(np.flatnonzero(there), told.episodes, strict=True):
             assert ends.env[i] == episode.env

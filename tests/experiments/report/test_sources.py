@@ -34,6 +34,7 @@ def write_run(path: Path, arms: tuple[str, ...] = ("ppo", "sauna")) -> Path:
             "arm": arm,
             "seed": seed,
             "member": f"{arm}/{seed}",
+            "iteration": x // 100 - 1,
             "env_steps": x,
             "kept_steps": x // 2,
             "return_mean": float(x * (1 + place)),

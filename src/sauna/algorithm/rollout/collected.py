@@ -25,6 +25,8 @@ class Collected(NamedTuple):
     env_steps: int
     kept_steps: int
     ended: int  # episodes that ended
+    return_mean: float  # over all of them; NaN if there are none
+    length_mean: float
     episodes: list[Episode]  # the latest of them; on the host all
 
 

@@ -51,6 +51,8 @@ class Ends(NamedTuple):
     """The episodes that ended in a rollout."""
 
     number: Array  # [] int32, all of them
+    return_mean: Array  # [] float32, over all of them; NaN if there are none
+    length_mean: Array  # [] float32
     return_: Array  # [WINDOW] float32, of the latest, in the order in which they ended
     length: Array  # [WINDOW] int32
     truncated: Array  # [WINDOW] bool
@@ -341,8 +343,15 @@ def _ends(rows: _Row) -> Ends:
         return x.ravel()[jnp.maximum(latest, 0)]
 
     env = jnp.broadcast_to(jnp.arange(rows.valid.shape[1]), rows.valid.shape)
+    number = jnp.sum(ended, dtype=jnp.int32)
+
+    def mean(x: Array) -> Array:
+        return jnp.sum(jnp.where(ended, x.ravel(), 0.0)) / number
+
     return Ends(
-        jnp.sum(ended, dtype=jnp.int32),
+        number,
+        mean(rows.episode_return),
+        mean(rows.episode_length),
         pick(rows.episode_return),
         pick(rows.episode_length),
         pick(rows.truncated),

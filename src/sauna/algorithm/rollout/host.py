@@ -9,6 +9,7 @@ smallest number of steps that some env still lacks: no env can overshoot.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -327,8 +328,16 @@ class HostCollector:
     def _collected(self, member: int) -> Collected:
         episodes = self._finish(member)
         rollout = Rollout(*(buffer[member] for buffer in self._buffers))
+        returns = [episode.return_ for episode in episodes]
+        lengths = [episode.length for episode in episodes]
         return Collected(
-            rollout, int(rollout.valid.sum()), int(rollout.keep.sum()), len(episodes), episodes
+            rollout,
+            int(rollout.valid.sum()),
+            int(rollout.keep.sum()),
+            len(episodes),
+            sum(returns) / len(returns) if returns else math.nan,
+            sum(lengths) / len(lengths) if lengths else math.nan,
+            episodes,
         )
 
     def _finish(self, member: int) -> list[Episode]:

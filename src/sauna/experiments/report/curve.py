@@ -49,7 +49,7 @@ def draw_curve(run: Path) -> Path | None:
     curves = member_curves(run_directory.rows(run))
     if not curves:
         return None
-    config = run_directory.read_config(run)["config"]
+    config = run_directory.read_config(run, needed=("config",))["config"]
     title = f"{config['env']}, preset {config['preset']}"
     path = run / "figures" / "learning_curve.png"
     return _draw(curves, {arm: arm for arm in curves}, title, TRAINING_RETURN, path)

@@ -108,7 +108,7 @@ def _read(path: Path, tag: str) -> list[Source]:
 
 def _read_run(run: Path) -> list[Source]:
     """Each arm of a run directory."""
-    config = run_directory.read_config(run)["config"]
+    config = run_directory.read_config(run, needed=("config",))["config"]
     points: dict[str, dict[int, list[dict[str, Any]]]] = {}
     for row in run_directory.rows(run):
         if "return_mean" in row:

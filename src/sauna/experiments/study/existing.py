@@ -54,7 +54,7 @@ def compare_existing(
       BadInput: a path cannot be read, there is one arm only, or the curves do not overlap.
     """
     for name, value in others.items():
-        if value != UNREAD.get(name):
+        if value != UNREAD.get(name, False):
             raise BadInput(f"{name}: not read for runs that exist")
     sources = read_sources(paths, tag)
     if len(sources) < 2:

@@ -203,7 +203,13 @@ def _collected(report: Report) -> Collected:
         for i in np.flatnonzero(ends.there)
     ]
     return Collected(
-        None, int(report.env_steps), int(report.kept_steps), int(ends.number), episodes
+        None,
+        int(report.env_steps),
+        int(report.kept_steps),
+        int(ends.number),
+        float(ends.return_mean),
+        float(ends.length_mean),
+        episodes,
     )
 
 

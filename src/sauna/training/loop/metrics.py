@@ -44,6 +44,9 @@ def metrics_row(
         "episode_lengths": [episode.length for episode in collected.episodes],
         "episode_truncated": [episode.truncated for episode in collected.episodes],
     }
+    if collected.ended:
+        row["episode_return_mean"] = collected.return_mean
+        row["episode_length_mean"] = collected.length_mean
     if counters.recent_returns:
         row["return_mean"] = float(np.mean(counters.recent_returns))
     if config.gae_over == "kept" and counters.reported_returns:
