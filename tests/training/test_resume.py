@@ -239,9 +239,9 @@ def test_new_folders_are_flushed_into_those_that_were_there(tmp_path, monkeypatc
 
 
 def test_rows_end_where_a_power_cut_has_spoilt_them_and_a_complete_run_says_so(tmp_path) -> None:
-    log = tmp_path / "metrics.jsonl"
+    log = tmp_path / "timing.jsonl"
     log.write_bytes(b'{"a": 1}\n\0\0\0"b": 2}\n{"c": 3}\n{"d"')
-    assert run_directory.rows(tmp_path) == [{"a": 1}]
+    assert run_directory.rows(tmp_path, "timing.jsonl") == [{"a": 1}]
     run_directory.write_json(tmp_path / "summary.json", {"complete": True})
-    with pytest.raises(SaunaError, match=r"metrics\.jsonl: line 2 is damaged"):
-        run_directory.rows(tmp_path)
+    with pytest.raises(SaunaError, match=r"timing\.jsonl: line 2 is damaged"):
+        run_directory.rows(tmp_path, "timing.jsonl")

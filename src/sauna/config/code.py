@@ -61,7 +61,9 @@ def changed_code(before: Mapping[str, Any], now: Mapping[str, str]) -> str:
 def _named_modules(settings: Mapping[str, Any], env: str) -> list[str]:
     found = [name.partition(":")[0] for _, name in named_code(settings)]
     gymnasium: Any = sys.modules.get("gymnasium")
-    spec = gymnasium and gymnasium.registry.get(env.rpartition(":")[2])
+    spec = None
+    if gymnasium and env.split("/")[0] not in PACKAGES:  # those count by their package's version
+        spec = gymnasium.registry.get(env.rpartition(":")[2])
     if spec is not None and isinstance(spec.entry_point, str):
         found.append(spec.entry_point.partition(":")[0])
     elif spec is not None:  # a class or a function
