@@ -177,6 +177,18 @@ def test_the_summary_ranks_the_arms_and_says_who_stopped_why(tmp_path: Path) -> 
     assert '<section id="ranking">' in page and "Learning curves by samples learned from" in page
 
 
+def test_a_stopped_tournament_says_what_is_open(tmp_path: Path) -> None:
+    spec = spec_of("gigaflow", "spo")
+    folder, place = tmp_path / "units", tmp_path / spec.name
+    place.mkdir()
+    for unit in next_round(spec, 3, folder).units[:2]:  # of ppo and gigaflow, not of its control
+        train(unit, folder)
+    summary = write(spec, next_round(spec, 3, folder).units, folder, place, "sauna compare")
+    assert {(row["seeds"], row["verdict"]) for row in summary["ranking"]} == {(0, "open")}
+    assert "its first seeds have not ended" in "\n".join(lines(summary))
+    assert "still open: gigaflow and spo" in (place / "report.html").read_text().lower()
+
+
 def test_compute_is_carried_from_the_runs_to_the_verdict(tmp_path: Path) -> None:
     """Gigaflow takes half of ppo's samples in each iteration and ends 100 above it: at 300 and
     its first third of 207.5 is passed on the way."""
