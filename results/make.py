@@ -40,7 +40,8 @@ CURVES_OF_RETURNS = "learning_curves"  # the figure's name
 CURVES = ("return_mean", "keep_rate", "vex_mean", "explained_variance")
 SHOWN_PLOTS = ("noise_variance", "sweep_coverage")  # of the measurements, those on a page
 POINTS = 30  # of each curve that are committed
-SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8")  # in the README's figure
+# Arms in the README's figure.
+SHOWN = ("ppo", "vex-head", "random-drop", "sauna 0.8 random", "sauna 0.8")
 
 
 def train(name: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from studies import TITLES, WHY, markdown, page, shown_label
+from studies import TITLES, WHY, former_controls, markdown, page, shown_label
 
 from sauna.experiments.measure import coverage_report, noise_report, posture_report
 from sauna.experiments.statistics import ALPHA, holm
@@ -136,6 +136,7 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
         why=WHY["dial"],
         correlations=markdown(correlations),
         controls=markdown(controls),
+        former=former_controls(measured["cells"]),
         arms=markdown([head, *arms]),
     )
 

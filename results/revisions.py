@@ -5,7 +5,8 @@
 The runs of a study may have been trained by several revisions of the package. Of every study, arm
 and revision the first and the last seed of one task are begun again with the package as it is now,
 up to the second point of the curves in `results/`, where every stored number is compared (six
-digits). Arms that repeat the drop rates of whole runs are left out.
+digits). Arms that the study has no more are left out: the random controls of 0.1.0, which repeated
+the drop rates of whole runs.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def chosen() -> Iterator[tuple[str, Arm, dict[str, Any], str]]:
         seen = set()
         arms = {arm.label: arm for arm in load_spec(name).arms}
         for cell in (load(name) or {"cells": []})["cells"]:
-            arm, revision = arms[cell["label"]], shown(cell["git"])
-            if arm.rates_of is None and (arm.label, revision) not in seen:
+            arm, revision = arms.get(cell["label"]), shown(cell["git"])
+            if arm is not None and (arm.label, revision) not in seen:
                 seen.add((arm.label, revision))
                 yield name, arm, cell, revision
 

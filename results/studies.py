@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,14 @@ def page_of(name: str) -> str:
 
 def shown_label(label: str) -> str:
     return LABELS.get(label, label)
+
+
+def former_controls(cells: Iterable[Mapping[str, Any]]) -> str:
+    """Says of which kind the random controls of 0.1.0 among these are; empty if there is none."""
+    arms = {cell["label"]: cell["rates_of"] for cell in cells if cell.get("rates_of")}
+    those = [f"`{shown_label(label)}` those of `{shown_label(arms[label])}`" for label in arms]
+    said = "A random control here repeated the drop rates of another run"
+    return f"{said}: {', '.join(those)}, seed by seed." if arms else ""
 
 
 def listed(sentences: Iterable[str]) -> str:

@@ -11,7 +11,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from studies import DECIDED, TITLES, WHY, folded, listed, markdown, page, shown_label
+from studies import (
+    DECIDED,
+    TITLES,
+    WHY,
+    folded,
+    former_controls,
+    listed,
+    markdown,
+    page,
+    shown_label,
+)
 
 from sauna.experiments.report.numbers import digits_of, digits_of_tasks, interval, number
 from sauna.experiments.study.spec import load_spec
@@ -46,6 +56,7 @@ def study_page(name: str, results: Mapping[str, Any], summary: Mapping[str, Any]
         facts=_facts(results) + about,
         overview=overview(results, summary),
         legend="" if alone else _legend(summary),
+        controls=former_controls(results["cells"]),
         caption="" if alone else CAPTION,
         decided=_decided([*summary["verdicts"], *summary["filtering"]]),
         missing=_missing(name, results),
@@ -174,8 +185,12 @@ def arms_table(task: str, name: str, results: Mapping[str, Any], summary: Mappin
 def _paper(task: str, label: str) -> str:
     """The paper's Table 1, beside its PPO and beside the variants of its method."""
     known = PAPER.get(unversioned(task), {})
-    column = "PPO" if label.startswith("ppo") else "SAUNA" if label.startswith("sauna") else ""
+    column = "PPO" if label.startswith("ppo") else "SAUNA" if _is_variant(label) else ""
     return f"{known[column][0]} ± {known[column][1]}" if column in known else "-"
+
+
+def _is_variant(label: str) -> bool:
+    return label.startswith("sauna") and not label.endswith("random")
 
 
 def _same_runs(results: Mapping[str, Any]) -> str:

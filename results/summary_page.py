@@ -17,6 +17,7 @@ from studies import (
     STUDIES,
     TITLES,
     folded,
+    former_controls,
     listed,
     load,
     markdown,
@@ -81,6 +82,9 @@ def index(covered: float) -> str:
         studies=markdown([head, *map(_scope, _all())]),
         covered=f"{covered:.0%}",
         revisions=_revisions(),
+        former=former_controls(
+            cell for name in CLAIMED for cell in (load(name) or {"cells": []})["cells"]
+        ),
         claims="\n\n".join(_claims()),
     )
 
@@ -115,8 +119,8 @@ def _revisions() -> str:
         "Several revisions of the package trained these runs",
         "Two runs of every study, arm and revision were begun again by revision "
         f"{stored['now']} (`{stored['command']}`). Up to the second point of the curves, {equal} "
-        f"of {number_of} gave the same numbers. Random controls were left out, because they "
-        "need whole runs of others.",
+        f"of {number_of} gave the same numbers. The random controls that repeated the drop "
+        "rates of other runs were left out.",
     )
 
 

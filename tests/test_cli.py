@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from command_line import sauna, small_flags
@@ -46,7 +45,7 @@ BAD = [
     (["train", WORLD, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
     (["train", WORLD, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
     (["train", WORLD, "--arm", "random-drop"], "random-drop needs a rate"),
-    (["train", WORLD, "--arm", "random-drop", "--drop-rate-from", "no"], "not a run directory"),
+    (["train", WORLD, "--drop-rate-from", "RUN"], "--drop-rate-from"),
     (["train", WORLD, "--arm", "sauna", "--gae-over", "kept"], "kept needs truncation=terminate"),
     (["train", WORLD, "--network", "nature-cnn"], "does not fit vector observations"),
     (["train", WORLD, "--env-processes", "3"], "more worker processes than environments"),
@@ -245,7 +244,7 @@ def test_help_shows_what_most_need_first_with_types_and_the_presets_values() -> 
 def test_compare_says_its_own_defaults() -> None:
     text = help_of("compare")
     assert "or which ones (100,101,110) (default 6)" in text
-    assert "(default sauna)" in text and "(default ppo,vex-head,random-drop,sauna)" in text
+    assert "(default sauna)" in text and "(default ppo,vex-head,sauna+random,sauna)" in text
 
 
 def test_one_seed_and_samples_per_minibatch() -> None:
@@ -422,51 +421,3 @@ def test_arms_are_the_options_table() -> None:
     quirks = ("kept", "joint", "replace", "kept", "terminate", "kept")
     assert options("sauna-reference") == ("sauna", 0.5, "minibatch", *quirks)
     assert {resolve({"env": "x", "arm": a}).threshold for a in ARMS if "sauna" in a} == {0.3}
-
-
-@pytest.mark.slow
-def test_random_drop_repeats_the_rates_of_a_run(tmp_path) -> None:
-    """Of its filtered arm: the rows of the PPO members beside it do not count."""
-    source, control = tmp_path / "source", tmp_path / "control"
-    flags = small_flags(seeds=2, steps=3000)
-    threshold = ["--threshold", "0.9", "--arm", "ppo,sauna"]
-    assert sauna("train", WORLD, "--out", str(source), *flags, *threshold).returncode == 0
-    done = sauna(
-        "train",
-        WORLD,
-        "--out",
-        str(control),
-        *flags,
-        "--arm",
-        "random-drop",
-        "--drop-rate-from",
-        str(source),
-    )
-    assert done.returncode == 0, done.stderr
-    for seed in (0, 1):
-        rates = [
-            np.mean(
-                [
-                    row["keep_rate"]
-                    for row in run_directory.rows(run)
-                    if row["seed"] == seed and row["arm"] != "ppo"
-                ]
-            )
-            for run in (source, control)
-        ]
-        assert rates[0] < 0.9 and abs(rates[0] - rates[1]) < 0.05
-    stored = run_directory.read_config(control)["drop_rates"]
-    assert len(stored) == 2 and all(0 < rate < 1 for rates in stored for rate in rates[1:])
-    done = sauna(
-        "train",
-        WORLD,
-        "--out",
-        str(tmp_path / "x"),
-        *small_flags(seeds="5,"),
-        "--arm",
-        "random-drop",
-        "--drop-rate-from",
-        str(source),
-    )
-    assert done.returncode == 2 and "has no rows of seed 5" in done.stderr
-    assert not (tmp_path / "x").exists()

@@ -172,7 +172,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "the rate against members, environments, width and processes instead"
     bench.add_argument("--scale", action="store_true", help=text)
     bench.add_argument("--json", metavar="FILE", help="also write the figures there")
-    own = ("env", "steps", "out", "drop_rate_from")
+    own = ("env", "steps", "out")
     add_fields(bench, [n for n in FIELDS if n not in own], {**values, "seeds": 6})
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)

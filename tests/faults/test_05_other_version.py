@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, Trap, played_back, record, trained_here, until
+from faults.canned import BACKENDS, WORLD, Trap, played_back, record, trained_here, until
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
+from helpers import SMALL
 from sauna.config import presets
 from sauna.config.settings import FIELDS, TYPES, fields_with
 from sauna.experiments.evaluate.artifact import load_artifact
+from sauna.experiments.evaluate.episodes import evaluate
+from sauna.experiments.inspect.inspection import examine
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 
@@ -29,7 +32,6 @@ OTHERS = {
     "seeds": [7],
     "preset": "mujoco-release",
     "hidden": [8, 9],
-    "drop_rate_from": "elsewhere",
     "gamma": 0.5,
     "gae_lambda": 0.5,
     "drop_rate": 0.25,
@@ -203,6 +205,40 @@ def test_an_old_run_ends_alike_under_other_presets(tmp_path: Path, monkeypatch) 
         monkeypatch.setitem(presets.PRESETS, "mujoco", other)
         monkeypatch.setitem(presets.ARMS, "ppo", {"filter": "sauna", "vex_coef": 0.2})
     assert ended[0] == ended[1]
+
+
+def test_a_run_of_0_1_0_that_repeats_drop_rates_is_played_and_not_resumed(tmp_path: Path) -> None:
+    """One of today's, stored as 0.1.0 stored it."""
+    run, settings = tmp_path / "run", {"arm": "random-drop", "drop_rate": 0.4, "vex_coef": 0.1}
+    sauna.train(WORLD, quiet=True, out=run, **SMALL, **settings)
+    former = {"drop_rate": 0.0, "drop_rate_from": "elsewhere"}
+    stored = run_directory.read_config(run)
+    stored["config"] |= former
+    run_directory.write_json(run / "config.json", {**stored, "drop_rates": [[0.4] * 9]})
+    for path in checkpoint.numbered(run / "checkpoints"):
+        manifest = json.loads((path / "manifest.json").read_text())
+        manifest["config"] |= former
+        manifest["manifest_sha256"] = checkpoint._digest(manifest)
+        (path / "manifest.json").write_text(json.dumps(manifest))
+    (run / "summary.json").unlink()
+    found = examine(
+        run,
+        load_artifact(run),
+        "random-drop/0",
+        episodes=2,
+        deterministic=False,
+        seed=0,
+        frames=False,
+        say=print,
+    )
+    assert found.trained_keep_rate == pytest.approx(0.6, abs=0.2)
+    assert found.hypers.drop_rate == pytest.approx(1 - found.trained_keep_rate)
+    assert 0.3 < found.decisions.keep.mean() < 0.9
+    assert len(evaluate(run, episodes=1)["members"]["random-drop/0"]["returns"]) == 1
+    before = _tree(run)
+    with pytest.raises(BadInput, match=r"drop_rate_from: .* repeats the drop rates of another run"):
+        sauna.resume(run, quiet=True)
+    assert _tree(run) == before
 
 
 def test_other_versions_of_the_libraries_are_told(tmp_path: Path, capsys, monkeypatch) -> None:

@@ -21,7 +21,7 @@ from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import Program, make_program
 from sauna.algorithm.types import member_keys
 from sauna.envs.host import mujoco_envs, mujoco_tasks
-from sauna.training.loop.budget import hypers_of, step_limit
+from sauna.training.loop.budget import hypers_now, step_limit
 from sauna.training.loop.host import _learn, make_envs
 from sauna.training.loop.member_state import Counters
 
@@ -63,7 +63,7 @@ class Trainer:
     def collect(self, iteration: int) -> list:
         job = self.job
         hypers = [
-            hypers_of(job, p, self.done[p], iteration)._replace(**self.changed)
+            hypers_now(job.members[p].config, self.done[p])._replace(**self.changed)
             for p in range(MEMBERS)
         ]
         limit = np.array([step_limit(job.config, c) for c in self.done])

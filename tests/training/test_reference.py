@@ -23,7 +23,7 @@ from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import member_keys
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
-from sauna.training.loop.budget import hypers_of, step_limit
+from sauna.training.loop.budget import hypers_now, step_limit
 from sauna.training.loop.member_state import Counters
 from worlds import Scripted
 
@@ -166,7 +166,7 @@ class Setup:
         envs = GymnasiumEnvs(Scripted, [(3, n) for n in range(N)])
         self.collector = HostCollector(self.program, job.spaces, envs, [self.keys])
         self.collector.start()
-        self.hypers = hypers_of(job, 0, Counters(), 0)
+        self.hypers = hypers_now(job.members[0].config, Counters())
 
     def collect(self, iteration: int):
         limit = np.array([step_limit(self.config, Counters())])

@@ -25,7 +25,12 @@ WORLD = "worlds:Scripted"
 
 @pytest.mark.parametrize("stops", [(1, 4, 7), pytest.param((2, 3, 5, 6), marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    "settings", [{"arm": "sauna", "threshold": 0.9, "seeds": 2}, {"arm": "ppo"}]
+    "settings",
+    [
+        {"arm": "sauna", "threshold": 0.9, "seeds": 2},
+        {"arm": "sauna+random", "threshold": 0.9},
+        {"arm": "ppo"},
+    ],
 )
 def test_interrupted_after_any_iteration(stops: tuple[int, ...], settings) -> None:
     job = make_job(WORLD, envs=2, steps=512, **settings)

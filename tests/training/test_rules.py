@@ -14,6 +14,7 @@ from helpers import configured, equal, make_job, resumed, train_here
 from sauna.algorithm.learner.program import make_learner, make_parts
 from sauna.algorithm.learner.update import device_minibatch_order
 from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.selection.control import controlled_filter
 from sauna.algorithm.types import Hypers, member_keys, selection_key
 from sauna.config.presets import ARMS
 from sauna.envs.spaces import Spaces
@@ -59,6 +60,40 @@ def test_an_arm_trains_and_its_work_is_told(arm: str, place: str) -> None:
             np.testing.assert_allclose([row["sample_rate"] for row in recorder.rows], expected)
 
 
+@pytest.mark.parametrize("dropped", ["replace", pytest.param("mask", marks=slow)])
+@pytest.mark.parametrize("place", ["host", "device"])
+def test_a_control_keeps_as_many_steps_of_each_env_as_its_rule(
+    place: str, dropped: str, monkeypatch
+) -> None:
+    """In every iteration of a training. The first step of an env, which has no history, is kept."""
+    seen: list[tuple[np.ndarray, ...]] = []
+
+    def recorded(kind: str, keep: Any, advantage: Any, valid: Any, key: Any) -> Any:
+        chosen = controlled_filter(kind, keep, advantage, valid, key)
+        jax.debug.callback(
+            lambda *masks: seen.append(tuple(map(np.asarray, masks))),
+            keep,
+            chosen,
+            valid,
+            ordered=True,
+        )
+        return chosen
+
+    monkeypatch.setattr("sauna.algorithm.learner.samples.controlled_filter", recorded)
+    env = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}[place]
+    settings = {"arm": "sauna+random", "threshold": 0.9, "dropped": dropped, **WALK}
+    job = make_job(env, **settings, **({"backend": "device"} if place == "device" else {}))
+    rows = train_here(job).rows
+    ran = [masks for masks in seen if masks[2].any()]  # the device looks once more, in vain
+    assert len(ran) == len(rows) > 2
+    for (rule, chosen, valid), row in zip(ran, rows, strict=True):
+        np.testing.assert_array_equal(chosen.sum(0), rule.sum(0))
+        assert chosen[0].all() and not chosen[~valid].any()
+        assert row["keep_rate"] == pytest.approx(chosen.sum() / valid.sum()) and rule.sum() > 2
+    assert min(row["keep_rate"] for row in rows) < 0.9
+    assert any(not np.array_equal(rule, chosen) for rule, chosen, _ in ran)
+
+
 @pytest.mark.parametrize("place", ["host", pytest.param("device", marks=slow)])
 @pytest.mark.parametrize("arm", marked(STATEFUL))
 def test_a_rules_state_is_resumed_to_the_same_bytes(arm: str, place: str) -> None:
@@ -91,7 +126,7 @@ def test_the_device_learns_what_the_host_learns(arm: str) -> None:
     keys = member_keys(0)
     values = {name: jnp.float32(getattr(config, name)) for name in Hypers._fields}
     h, iteration = Hypers(**values), jnp.int32(3)
-    setting = Setting(keys, h, jnp.zeros(1), jnp.int32(128))
+    setting = Setting(keys, h, jnp.int32(128))
     parts = IterationParts(config, None, policy, make_parts(config, policy, spaces))  # type: ignore[arg-type]
     device, told = jax.jit(
         lambda state, rollout: learn_from(parts, state, rollout, setting, h, iteration)

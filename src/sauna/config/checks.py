@@ -88,10 +88,10 @@ def check_consistent(config: Config) -> None:
         )
     if config.keep_rate_target and (config.history, config.decision) != ("all", "env"):
         raise BadInput("keep_rate_target: needs history=all and decision=env")
-    if config.drop_rate and config.drop_rate_from:
-        raise BadInput("drop_rate: give either drop_rate or drop_rate_from, not both")
-    if config.filter == "random-drop" and not (config.drop_rate or config.drop_rate_from):
-        raise BadInput("drop_rate: random-drop needs a rate, or drop_rate_from=RUN")
+    if config.filter == "random-drop" and not config.drop_rate:
+        raise BadInput(
+            "drop_rate: random-drop needs a rate (arm sauna+random drops as many steps as sauna)"
+        )
     if config.env_processes and "env" in local_parts(config):
         raise BadInput(
             "env_processes: the environment cannot be imported by another process; "

@@ -64,8 +64,7 @@ def option(
       machine_local: machines that train together may differ in it.
       decided_by_study: a study or a comparison sets it itself.
       rule_of_experiment: a rule of the experiment rather than of the filter. An unfiltered arm that
-        shares the program of a filtered one takes it over, and so does a random control that
-        repeats its drop rates: only the filter differs.
+        shares the program of a filtered one takes it over: only the filter differs.
     """
     metadata = {name: value for name, value in locals().items() if name != "default"}
     return dataclasses.field(default=default, metadata=metadata)

@@ -401,11 +401,3 @@ class Config:
         shapes_program=False,
         read_when=readers.RANDOM,
     )
-    drop_rate_from: str = _selection(
-        "",
-        "a SAUNA run whose measured rates random-drop repeats, seed by seed",
-        shapes_program=False,
-        read_when=readers.RANDOM,
-        machine_local=True,
-        decided_by_study=True,
-    )

@@ -139,6 +139,7 @@ ARMS |= {
 }
 # Controls follow the rule that they are joined to: `gigaflow+random`.
 CONTROLS = ("random", "stride", "low-advantage", "reversed")
+RANDOM_CONTROL = "+random"  # ends the name of an arm that is another's matched random control
 
 ARM_HELP = {
     "ppo": "PPO (or A2C) alone: no Vex loss, nothing dropped",
@@ -190,7 +191,7 @@ TARGET_HELP = {
 }
 
 # The arms of a comparison where none are named; the first is the baseline.
-COMPARED = ("ppo", "vex-head", "random-drop", "sauna")
+COMPARED = ("ppo", "vex-head", "sauna+random", "sauna")
 COMPARED_SEEDS = 6
 
 

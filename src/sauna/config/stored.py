@@ -9,7 +9,7 @@ from typing import Any
 from sauna.config.presets import BEFORE, RunConfig, parse_all
 from sauna.config.settings import Config, to_json
 from sauna.system.errors import BadInput
-from sauna.system.migrations import with_arms
+from sauna.system.migrations import with_arms, without_removed
 
 
 def to_stored(run: RunConfig) -> dict[str, Any]:
@@ -34,19 +34,23 @@ def read_stored(stored: Mapping[str, Any]) -> RunConfig:
     if not stored.get("config"):
         raise BadInput("config: it holds no 'config'")
     config = stored_config(stored["config"])
-    arms = with_arms(dict(stored))["arms"]
+    arms: dict[str, dict[str, Any]] = with_arms(dict(stored))["arms"]
     if set(arms) != set(config.arm) or not all(isinstance(own, dict) for own in arms.values()):
         raise BadInput(f"config: 'arms' must hold a table for each of {', '.join(config.arm)}")
-    own = {arm: dataclasses.replace(config, **parse_all(arms[arm])) for arm in config.arm}
+    own = {
+        arm: dataclasses.replace(config, **parse_all(without_removed(arms[arm])))
+        for arm in config.arm
+    }
     return RunConfig(config, own)
 
 
 def stored_config(stored: Mapping[str, Any]) -> Config:
     """Reads the config that `settings.to_json` wrote, perhaps before some fields existed.
 
-    A field that is missing has its default, or what was done before it existed (`BEFORE`).
+    A field that is missing has its default, or what was done before it existed (`BEFORE`). One
+    that exists no more is left out.
 
     Raises:
       BadInput: a key is unknown, or a value cannot be read.
     """
-    return Config(**parse_all({**BEFORE, **stored}))
+    return Config(**parse_all({**BEFORE, **without_removed(dict(stored))}))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+REMOVED = ("drop_rate_from",)  # fields that 0.1.0 had: stored values are left out
 _UNFILTERED = ("ppo", "vex-head")
 _VEX_COEF = 0.5  # the default of 0.1.0
 
@@ -32,3 +33,8 @@ def with_arms(stored: dict[str, Any]) -> dict[str, Any]:
         arms[name] = {key: value for key, value in own.items() if config.get(key) != value}
     rest = {key: value for key, value in stored.items() if key != "given"}
     return {**rest, "arms": arms}
+
+
+def without_removed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Leaves out stored settings of fields that exist no more."""
+    return {name: value for name, value in settings.items() if name not in REMOVED}

@@ -86,7 +86,6 @@ class Coordinator:
             run.prepared.run,
             run.spaces,
             [int(index) for index in part],
-            [run.drop_rates[index] for index in part] if run.drop_rates else [],
             self._iteration,
             replay,
         )

@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sauna.config.checks import check_read, check_read_here, local_parts, own_parts
-from sauna.config.presets import Member, RunConfig, arm_settings, parse_all, resolve_run
+from sauna.config.presets import Member, RunConfig, parse_all, resolve_run
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.envs.spaces import SMALLEST_IMAGE, Spaces
-from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
-from sauna.system.safe_read import JSON_BYTES
 from sauna.training.loop.multihost import check_split, read_host_rank
 
 if TYPE_CHECKING:
@@ -218,35 +216,3 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
         and spaces.observation_kind == "vector",
         processes=min(processes, number),
     )
-
-
-def drop_rates_of(everyone: list[Member]) -> list[list[float]]:
-    """Reads, per member, the drop rate that the run it repeats had in every iteration.
-
-    Raises:
-      BadInput: that run is not complete, lacks a seed, is not of exactly one filtered arm, or has
-        more rates than `config.json` can hold.
-    """
-    source = everyone[0].config.drop_rate_from
-    if not source:
-        return []
-    arms = run_directory.read_config(Path(source))["config"]["arm"]
-    filtered = [arm for arm in arms if arm_settings(arm)["filter"] != "none"]
-    if len(filtered) != 1:
-        raise BadInput(f"drop_rate_from: {source} has {len(filtered)} filtered arms; it needs one")
-    if not run_directory.is_complete(Path(source)):
-        raise BadInput(f"drop_rate_from: {source} is not complete")
-    rates: dict[int, list[float]] = {}
-    for row in run_directory.rows(Path(source)):
-        if row["arm"] == filtered[0]:
-            rates.setdefault(row["seed"], []).append(1.0 - row["keep_rate"])
-    for member in everyone:
-        if member.seed not in rates:
-            raise BadInput(f"drop_rate_from: {source} has no rows of seed {member.seed}")
-    found = [rates[member.seed] for member in everyone]
-    if len(json.dumps(found)) > JSON_BYTES // 2:  # what cannot be read again is not begun
-        raise BadInput(
-            f"drop_rate_from: {source} has {max(map(len, found))} iterations, too many "
-            f"to repeat for {len(found)} seeds in one run"
-        )
-    return found

@@ -30,7 +30,6 @@ from sauna.training.prepare import (
     Prepared,
     check_own_parts,
     check_writes,
-    drop_rates_of,
     examine,
     place,
 )
@@ -43,14 +42,11 @@ class Run:
     Attributes:
       path: its directory, which this process has locked until `lock` is closed.
       prepared: its settings and what is known of its environment.
-      drop_rates: of each member and iteration; empty: the config's constant one.
       made: whether the directory was made by this object's maker.
     """
 
-    def __init__(
-        self, path: Path, prepared: Prepared, drop_rates: list[list[float]], made: bool = False
-    ) -> None:
-        self.path, self.prepared, self.drop_rates, self.made = path, prepared, drop_rates, made
+    def __init__(self, path: Path, prepared: Prepared, made: bool = False) -> None:
+        self.path, self.prepared, self.made = path, prepared, made
         self.code = code_of(to_stored(prepared.run))
         self.lock: IO[str] = run_directory.lock(path)
 
@@ -96,7 +92,6 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         placed = place(resolve_run(overrides))
         check_writes(placed.config)
         prepared = examine(placed, overrides)
-        drop_rates = drop_rates_of(prepared.members)
         TensorBoard.check(prepared.config)
         check_own_parts(prepared)
     path, made = _make_directory(prepared.config)
@@ -105,7 +100,6 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
     stored = {
         **to_stored(prepared.run),
         "spaces": list(prepared.spaces),
-        "drop_rates": drop_rates,
         "exact_resume": prepared.differs is None,
         "versions": run_directory.versions(),
         "git": run_directory.git_revision(),
@@ -113,7 +107,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
     }
     stored["seal"] = seal(stored)
     with disk_errors(path):
-        run = Run(path, prepared, drop_rates, made)
+        run = Run(path, prepared, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
             run_directory.write_config(path, {**stored, "code": run.code})
@@ -179,10 +173,9 @@ def follow(overrides: Mapping[str, Any], display: Display) -> None:
     configure_jax(config.devices if config.device == "cpu" else 0, config.device)
     join(read_host_rank(config.distributed))  # before an environment makes its first array
     prepared = examine(placed, overrides)
-    job = prepared.job(drop_rates=drop_rates_of(prepared.members))
     from sauna.training.worker import train_members
 
-    train_members(job, Follower(display.say))
+    train_members(prepared.job(), Follower(display.say))
 
 
 @kept_folder()
@@ -211,6 +204,7 @@ def reopen(
         if name not in resumable:
             raise BadInput(f"{name}: cannot be changed on resume (can: {', '.join(resumable)})")
     before = read_stored(stored)
+    _check_source(path, stored)
     changed = before.replace(**parse_all(changes))
     check_consistent(changed.config)
     TensorBoard.check(changed.config)
@@ -221,7 +215,7 @@ def reopen(
     prepared = examine(changed, changes)
     _check_spaces(prepared, path, stored["spaces"])
     with disk_errors(path):
-        run = Run(path, prepared, stored.get("drop_rates", []))
+        run = Run(path, prepared)
     differs = changed_code(stored.get("code", run.code), run.code)
     if differs and not accept_changed_code:
         run.lock.close()
@@ -234,6 +228,19 @@ def reopen(
             stored = run_directory.with_code(stored, run.code) if differs else stored
             run_directory.write_config(path, {**stored, "seal": seal(stored)})
     return run
+
+
+def _check_source(path: Path, stored: Mapping[str, Any]) -> None:
+    """Refuses a run of 0.1.0 that takes its drop rates from another run.
+
+    Raises:
+      BadInput: it is one.
+    """
+    if stored["config"].get("drop_rate_from") or stored.get("drop_rates"):
+        raise BadInput(
+            f"drop_rate_from: {path} repeats the drop rates of another run, which only 0.1.0 can "
+            f"continue; train arm sauna+random instead, whose control needs no other run"
+        )
 
 
 def _check_spaces(prepared: Prepared, path: Path, stored: list[Any]) -> None:

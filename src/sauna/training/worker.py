@@ -130,7 +130,6 @@ def write_job(
     run: RunConfig,
     spaces: Spaces,
     chosen: Sequence[int],
-    drop_rates: Sequence[list[float]],
     start: int,
     replay: bool,
 ) -> dict[str, Any]:
@@ -138,13 +137,12 @@ def write_job(
 
     Args:
       chosen: the indices of the worker's members among those of `run`.
-      drop_rates, start, replay: see `Job`.
+      start, replay: see `Job`.
     """
     return {
         **to_stored(run),
         "spaces": list(spaces),
         "members": list(chosen),
-        "drop_rates": list(drop_rates),
         "start": start,
         "replay": replay,
     }
@@ -155,7 +153,6 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
     prepared = Prepared(read_stored(header), read_spaces(header["spaces"]), None)
     return prepared.job(
         header["members"],
-        drop_rates=header["drop_rates"],
         restored=arrays or None,
         start=header["start"],
         replay=header["replay"],

@@ -304,7 +304,7 @@ def test_a_comparison_calls_its_baseline_by_the_algorithm() -> None:
 
 def test_the_study() -> None:
     spec = load_spec("a2c")
-    assert [arm.label for arm in spec.arms] == ["a2c", "vex-head", "random-drop", "sauna 0.8"]
+    assert [arm.label for arm in spec.arms] == ["a2c", "vex-head", "sauna 0.8 random", "sauna 0.8"]
     assert spec.tasks == ["Hopper-v5", "InvertedPendulum-v5"]
     for arm in spec.arms:
         config = check(arm, "Hopper-v5")

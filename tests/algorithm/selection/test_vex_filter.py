@@ -250,7 +250,7 @@ def test_settings_of_the_threshold_that_contradict_are_refused(settings, message
 def test_a_schedule_follows_the_env_steps() -> None:
     for schedule, expected in (("constant", 0.8), ("rising", 0.2), ("falling", 0.6)):
         config = configured(arm="sauna", threshold=0.8, threshold_schedule=schedule, steps=10_000)
-        now = hypers_now(config, [], Counters(env_steps=2_500, kept_steps=9), 3)
+        now = hypers_now(config, Counters(env_steps=2_500, kept_steps=9))
         np.testing.assert_allclose(now.threshold, expected, rtol=1e-6)
         told = moved_threshold(None, now, config)  # type: ignore[arg-type] # no rollout is read
         np.testing.assert_allclose(told, np.nan if schedule == "constant" else expected, rtol=1e-6)

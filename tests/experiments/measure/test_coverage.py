@@ -78,7 +78,11 @@ def test_a_trade_is_found_where_there_is_one_and_only_there() -> None:
     assert "no answer yet" in verdicts(study(*RISING[:2]))[0]
 
 
-def test_an_arm_is_compared_with_its_random_control_pair_by_pair() -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [{"arm": "random-drop", "rates_of": "0.5"}, {"arm": "sauna+random", "threshold": 0.5}],
+)
+def test_an_arm_is_compared_with_its_random_control_pair_by_pair(settings: dict[str, Any]) -> None:
     """Entropy and coverage of the controls lie 0.2 below, seed by seed; or not at all."""
     for gaps, said in (
         (
@@ -90,11 +94,11 @@ def test_an_arm_is_compared_with_its_random_control_pair_by_pair() -> None:
         ([0.2, -0.3, 0.1], "show no difference (threshold minus control: entropy 0.0"),
     ):
         values = [x - gap for x, gap in zip([0.5, 0.6, 0.4], gaps, strict=True)]
-        control = cell("control", values, arm="random-drop", rates_of="0.5")
+        control = cell("control", values, **settings)
         found = verdicts(study(*RISING, control))
         assert len(found) == 2 and said in found[1], found[1]
         assert found[1].startswith("A-v0: threshold 0.5 and its matched random control ")
-    few = cell("control", [0.1], arm="random-drop", rates_of="0.5")
+    few = cell("control", [0.1], **settings)
     assert "have too few pairs yet" in verdicts(study(*RISING, few))[1]
     assert "; 9 members." in verdicts(study(*RISING))[0]
     part = [*RISING[:2], {**RISING[2], "seeds": 4}]
@@ -125,6 +129,8 @@ def test_every_arm_stands_at_its_threshold() -> None:
         cell("keeps half", [0.7], keep_rate_target=0.5),
         cell("control", [0.1], arm="random-drop", rates_of="0.5"),
         cell("moved control", [0.1], arm="random-drop", rates_of="0 to 1"),
+        cell("control of 1", [0.1], arm="sauna+random", threshold=1.0),
+        cell("control of half", [0.1], arm="sauna+random", keep_rate_target=0.5),
     ]
     found = {mark.label: mark for mark in marks(study(*RISING, *others), "A-v0")}
     assert {label: mark.threshold for label, mark in found.items()} == {
@@ -135,7 +141,11 @@ def test_every_arm_stands_at_its_threshold() -> None:
         "keeps half": 0.9,
         "control": 0.5,
         "moved control": 0.9,
+        "control of 1": 1.0,
+        "control of half": 0.9,
     }
+    followed = [found[x].drops_like for x in ("control", "control of 1", "control of half")]
+    assert followed == ["0.5", "1.0", "keeps half"]
     assert [found[x].kind for x in ("0 to 1", "keeps half")] == ["scheduled", "target keep rate"]
     page = report(study(*RISING, *others))
     assert [plot.name for plot in page.plots] == [
@@ -145,7 +155,7 @@ def test_every_arm_stands_at_its_threshold() -> None:
         "sweep_final_return",
     ]
     assert len(page.plots[1].panels[0].lines) == 4
-    assert len(text_table(study(*RISING, *others))) == 8
+    assert len(text_table(study(*RISING, *others))) == 10
 
 
 def test_what_is_the_same_for_all_follows_nothing() -> None:

@@ -25,14 +25,14 @@ def cell(task: str, label: str, scores: np.ndarray, keep_rate: float = 1.0) -> d
         }
         for x in scores.tolist()
     ]
-    return {"task": task, "label": label, "members": members}
+    return {"task": task, "label": label, "arm": label, "members": members}
 
 
 def study(sauna: tuple[np.ndarray, ...], keep_rate: float = 0.8) -> dict[str, Any]:
     cells = [cell(task, "ppo", LOW) for task in TASKS]
     pairs = zip(TASKS, sauna, strict=False)
     cells += [cell(task, "sauna", x, keep_rate) for task, x in pairs]
-    return {"settings": {"seeds": 6}, "cells": cells}
+    return {"baseline": "ppo", "settings": {"seeds": 6}, "cells": cells}
 
 
 def said(results: dict[str, Any], claim: int = 0) -> dict[str, str]:
@@ -79,7 +79,7 @@ def test_what_is_not_trained_to_the_end_is_not_judged() -> None:
 def test_it_holds_on_the_papers_tasks_and_on_no_fewer() -> None:
     cells = [cell(task, "ppo", LOW) for task in PAPER]
     cells += [cell(task, "sauna", HIGH, 0.8) for task in PAPER]
-    results = {"settings": {"seeds": 6}, "cells": cells}
+    results = {"baseline": "ppo", "settings": {"seeds": 6}, "cells": cells}
     assert said(results)["so"] == "holds; better over the tasks by the interval"
     for member in results["cells"][-1]["members"]:
         member["keep_rate"] = 1.0
@@ -100,6 +100,32 @@ def test_no_credit_where_it_filtered_nothing_on_the_task_it_won() -> None:
     assert said(results)["so"] == (
         "better on A, not decided on the other 2; it drops next to nothing on A"
     )
+
+
+def test_a_random_control_of_either_kind_is_found() -> None:
+    """One that repeated the drop rates of `sauna 0.8`, as in 0.1.0, and one with its settings."""
+    threshold = "sauna train A-v5 --threshold {} --arm {} --seeds 0,1"
+    own = [
+        cell(task, "sauna 0.8", HIGH, 0.8)
+        | {"arm": "sauna", "command": threshold.format(0.8, "sauna")}
+        for task in TASKS
+    ]
+    former = [cell(task, "coin", LOW, 0.8) | {"rates_of": "sauna 0.8"} for task in TASKS]
+    today, other = (
+        [
+            cell(task, f"{value} random", LOW, 0.8)
+            | {"arm": "sauna+random", "command": threshold.format(value, "sauna+random")}
+            for task in TASKS
+        ]
+        for value in (0.8, 0.3)
+    )
+    results = {"baseline": "ppo", "settings": {"seeds": 6}}
+    for cells, label in ((former, "coin"), (today, "0.8 random"), (former + today, "0.8 random")):
+        row = said({**results, "cells": own + other + cells}, claim=4)
+        assert (row["against"], row["so"].split(";")[0]) == (label, "better on A, B, C")
+    row = said({**results, "cells": own + former + today[:2]}, claim=4)
+    assert row["against"] == "coin"  # until the other has as many tasks
+    assert claims_rows({**results, "cells": own + other}) == []
 
 
 def test_failed_seeds_count_as_the_worst_outcome() -> None:

@@ -42,7 +42,8 @@ label = "sauna"
 threshold = 0.9
 
 [[arms]]
-label = "random-drop"
+label = "sauna+random"
+threshold = 0.9
 """
 
 slow = pytest.mark.slow

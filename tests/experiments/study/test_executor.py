@@ -76,19 +76,18 @@ def test_one_that_crashed_once_is_continued_and_not_split(tmp_path: Path) -> Non
     assert executor.starts[ppo.name] == 2 and not list(tmp_path.rglob("split.json"))
 
 
-def test_a_coin_tries_again_with_its_source(tmp_path: Path, monkeypatch) -> None:
-    """The seed's folder is removed, as the documentation says, and only that of the source."""
-    arms = [{"label": "sauna"}, {"label": "random-drop"}]
-    _, (sauna, coin) = run(tmp_path, {**TWO, "arms": arms})
-    places = [tmp_path / unit.name / "seed-1" for unit in (sauna, coin)]
+def test_a_failed_seed_tries_again_once_its_folder_is_removed(tmp_path: Path, monkeypatch) -> None:
+    """As the documentation says; the other arm's stays failed."""
+    _, units = run(tmp_path, TWO)
+    places = [tmp_path / unit.name / "seed-1" for unit in units]
     assert all((place / "failed.json").exists() for place in places)
-    executor, _ = run(tmp_path, {**TWO, "arms": arms})
+    executor, _ = run(tmp_path, TWO)
     assert not executor.starts  # nothing was removed
     shutil.rmtree(places[0])
     monkeypatch.setattr(Broken, "unlucky", None)
-    run(tmp_path, {**TWO, "arms": arms})
-    assert all(run_directory.is_complete(place / "run") for place in places)
-    assert not list(tmp_path.rglob("failed.json"))
+    run(tmp_path, TWO)
+    assert run_directory.is_complete(places[0] / "run")
+    assert list(tmp_path.rglob("failed.json")) == [places[1] / "failed.json"]
 
 
 def test_two_labels_of_the_same_settings_are_one_unit(tmp_path: Path) -> None:

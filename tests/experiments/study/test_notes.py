@@ -9,7 +9,7 @@ from sauna.experiments.statistics import compare, least_seeds
 from sauna.experiments.study.command import comparison
 from sauna.experiments.study.notes import before_training
 
-ARMS = ("ppo", "vex-head", "random-drop", "sauna")
+ARMS = ("ppo", "vex-head", "sauna+random", "sauna")
 
 
 @pytest.mark.parametrize("arms", [ARMS, ("ppo", "sauna")])

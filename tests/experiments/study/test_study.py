@@ -21,7 +21,7 @@ from command_line import sauna, small_flags
 from helpers import SMALL, environment
 from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
-from sauna.config.settings import parse
+from sauna.config.settings import parse, to_json
 from sauna.envs.spaces import describe
 from sauna.experiments.measure.measurement import find_measurement
 from sauna.experiments.study.command import compare_command, comparison
@@ -50,11 +50,11 @@ QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
         ({"arms": [3]}, "list of tables"),
         ({"tasks": "A"}, "tasks must be a list"),
         ({"baseline": "poo"}, "no arm 'poo'.*'ppo'"),
-        ({"arms": [{"label": "ppo"}, {"label": "random-drop"}]}, "needs a filtered arm"),
         (
-            {"arms": [{"label": "sauna", "seeds": 2}, {"label": "random-drop"}]},
-            "tasks and the seeds",
+            {"arms": [{"label": "ppo"}, {"label": "random-drop"}]},
+            "drop needs a rate .arm sauna",
         ),
+        ({"arms": [{"label": "sauna-reference+random"}]}, "control: needs gae_over=all"),
         ({"tasks": ["A-v0", "A-v0"]}, "each of them once"),
         ({"arm": "sauna"}, "unknown key 'arm'"),
         ({"name": "../x"}, "cannot be a folder"),
@@ -66,11 +66,8 @@ QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
             "'ppo', the baseline of 'sauna', is not trained on A-v0",
         ),
         ({"arms": [{"label": ["x"]}]}, "arm must be a name"),
-        ({"arms": [{"label": "ppo"}, {"label": "random-drop", "rates_of": "ppo"}]}, "not filter"),
-        ({"arms": [{"label": "random-drop", "rates_of": 3}]}, "rates_of must be a name"),
-        ({"arms": [{"label": "random-drop", "rates_of": "random-drop"}]}, "does not filter"),
+        ({"arms": [{"label": "ppo"}, {"label": "sauna", "rates_of": "ppo"}]}, "key 'rates_of' in"),
         ({"threshold": 0.8, "arms": [{"label": "ppo"}]}, "threshold is read by none of the arms"),
-        ({"arms": [{"label": "ppo", "rates_of": "ppo"}]}, "read by random-drop only"),
         ({"arms": [{"label": "x", "arm": "ppo", "threshold": 0.3}]}, "arm 'x': threshold: not re"),
         ({"minibatches": 7}, "does not divide"),
         ({"seeds": "0"}, "seeds: empty"),
@@ -84,23 +81,17 @@ def test_mistakes_in_a_study_are_named(change: dict, message: str) -> None:
 def test_a_setting_for_all_arms_goes_to_those_that_read_it() -> None:
     spec = comparison("A-v0", COMPARED, {"threshold": 0.8, "gamma": 0.9, "vex_coef": 0.1})
     settings = {arm.label: arm.settings for arm in spec.arms}
-    assert settings["sauna"] == {"threshold": 0.8, "gamma": 0.9, "vex_coef": 0.1}
+    every = {"threshold": 0.8, "gamma": 0.9, "vex_coef": 0.1}
+    assert settings["sauna"] == settings["sauna+random"] == every
     assert settings["ppo"] == {"gamma": 0.9}
-    assert settings["vex-head"] == settings["random-drop"] == {"gamma": 0.9, "vex_coef": 0.1}
+    assert settings["vex-head"] == {"gamma": 0.9, "vex_coef": 0.1}
 
 
 def test_beside_the_reference_all_arms_take_its_rules() -> None:
-    spec = comparison("A-v0", ("ppo", "random-drop", "sauna-reference"), {})
+    spec = comparison("A-v0", ("ppo", "vex-head", "sauna-reference"), {})
     configs = [check(arm, "A-v0") for arm in spec.arms]
     assert {c.truncation for c in configs} == {"terminate"}
     assert {c.budget for c in configs} == {"env"}
-
-
-def test_a_coin_beside_a_masked_arm(tmp_path) -> None:
-    """What one of the copied rules is read with comes along."""
-    arms = [{"label": "sauna-reference", "dropped": "mask"}, {"label": "random-drop"}]
-    coin = check(read_spec({**TWO, "arms": arms, "baseline": "sauna-reference"}).arms[1], "A-v0")
-    assert (coin.dropped, coin.gae_over) == ("mask", "kept")
 
 
 @pytest.mark.parametrize(
@@ -164,15 +155,16 @@ def test_studies_of_the_paper(name: str) -> None:
     for arm in spec.arms:
         config = check(arm, spec.tasks[0])
         steps = 10**8 if name.startswith("fig4") else 10**6
-        assert config.steps == (3 * 10**6 if name == "minatar" else steps)
+        others = {"minatar": 3 * 10**6, "selection-pilot-hopper": 3 * 10**5}
+        assert config.steps == others.get(name, steps)
         # Only the filter may differ from the baseline: the same rules of truncation and budget.
         if arm.baseline and not arm.label.startswith("ppo"):
             base = check(arms[arm.baseline], spec.tasks[0])
             assert config.truncation == base.truncation
             assert config.budget == base.budget or "kept steps" in arm.label
-    assert {a.arm for a in spec.arms} <= set(ARMS)
+    assert {a.arm.removesuffix("+random") for a in spec.arms} <= set(ARMS)
     if name == "fig3":
-        paper = {"ppo", "vex-head", "random-drop", "sauna", "sauna-paper", "sauna-reference"}
+        paper = {"ppo", "vex-head", "sauna+random", "sauna", "sauna-paper", "sauna-reference"}
         assert {a.arm for a in spec.arms} == paper
         assert {len(a.seeds) for a in spec.arms} == {6} and len(spec.tasks) == 6
 
@@ -188,22 +180,16 @@ def test_the_papers_three_settings_of_flagrun() -> None:
     assert found == {"fig4a": ((64, 64), 32), "fig4b": (wide, 32), "fig4c": (wide, 128)}
 
 
-def test_units_share_folders_with_equal_settings_and_follow_their_source() -> None:
+def test_units_share_folders_with_equal_settings() -> None:
     units = {u.name: u for u in units_of(load_spec("fig3"), SEEDS)}
     again = {u.name for u in units_of(load_spec("table1"), SEEDS)}
     assert again < set(units)
     assert again == {u.name for u in units_of(load_spec("fig2"), SEEDS)}
-    seen: set[str] = set()
-    for name, unit in units.items():
-        assert len(unit.seeds) <= SEEDS
-        if unit.label == "random-drop":
-            assert unit.source in seen and units[unit.source].seeds == unit.seeds
-            assert units[unit.source].label == "sauna 0.8"
-        seen.add(name)
+    assert all(len(unit.seeds) <= SEEDS for unit in units.values())
     spec = read_spec({**TWO, "seeds": 4})
     assert [seeds_per_unit(spec, cores) for cores in (1, 4, 5, 64)] == [2, 2, 1, 1]
-    spec = comparison("A-v0", COMPARED, {})  # 18 of its 24 members can start at once
-    sizes = [seeds_per_unit(spec, cores) for cores in (2, 6, 7, 9, 10, 64)]
+    spec = comparison("A-v0", COMPARED, {})  # of 24 members
+    sizes = [seeds_per_unit(spec, cores) for cores in (2, 8, 9, 12, 13, 64)]
     assert sizes == [3, 3, 2, 2, 1, 1]
 
 
@@ -225,11 +211,11 @@ def test_its_units_are_those_of_a_study_with_the_same_settings() -> None:
     assert {u.name for u in units_of(ours, SEEDS)} < fig3
 
 
-def test_a_coin_shares_the_rules_of_the_arm_whose_rates_it_repeats() -> None:
-    spec = comparison("A-v0", ("ppo", "random-drop", "sauna-reference"), {})
-    coin, source = (check(spec.arms[i], "A-v0") for i in (1, 2))
-    for name in ("gae_over", "max_env_steps_factor", "vex_target", "truncation", "budget"):
-        assert getattr(coin, name) == getattr(source, name)
+def test_the_default_control_differs_from_its_arm_in_the_control_alone() -> None:
+    spec = comparison("A-v0", COMPARED, {"threshold": 0.8, "keep_rate_target": 0.0})
+    control, arm = (to_json(check(spec.arms[i], "A-v0")) for i in (2, 3))
+    assert {name for name in arm if arm[name] != control[name]} == {"arm", "control"}
+    assert (arm["control"], control["control"]) == ("none", "random")
 
 
 def rows_of(out: Path) -> dict[str, bytes]:
@@ -262,7 +248,7 @@ def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) ->
     results = json.loads((place / "results.json").read_text())
     summary = json.loads((place / "summary.json").read_text())
     assert summary == summarize(results)
-    assert [c["label"] for c in results["cells"]] == ["ppo", "vex-head", "random-drop", "sauna"]
+    assert [c["label"] for c in results["cells"]] == ["ppo", "vex-head", "sauna+random", "sauna"]
     for cell in results["cells"]:
         assert [(m["seed"], m["status"]) for m in cell["members"]] == [
             (seed, "complete") for seed in range(4)
@@ -275,15 +261,16 @@ def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) ->
     assert (place / "figures" / "learning_curves.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_random_drop_takes_the_rates_of_the_same_seeds(compared: Path) -> None:
-    rates: dict[tuple[str, int], list[float]] = {}
+def test_the_control_begins_as_its_arm_does_and_learns_otherwise(compared: Path) -> None:
+    """One seed begins alike: with no update behind them both keep the same number of steps."""
+    rows: dict[tuple[str, int], list[dict[str, Any]]] = {}
     for path in (compared / "units").rglob("metrics.jsonl"):
         for row in run_directory.rows(path.parent):
-            rates.setdefault((row["arm"], row["seed"]), []).append(row["keep_rate"])
-    for path in (compared / "units").glob("*random-drop*/run/config.json"):
-        stored = json.loads(path.read_text())
-        for seed, given in zip(stored["config"]["seeds"], stored["drop_rates"], strict=True):
-            assert [1 - rate for rate in given] == pytest.approx(rates["sauna", seed])
+            rows.setdefault((row["arm"], row["seed"]), []).append(row)
+    for seed in range(4):
+        arm, control = rows["sauna", seed], rows["sauna+random", seed]
+        assert arm[0]["keep_rate"] == control[0]["keep_rate"]
+        assert arm[-1]["policy_loss"] != control[-1]["policy_loss"]
 
 
 def stamps(out: Path) -> dict[Path, int]:
@@ -374,8 +361,8 @@ def wait_for_units(out: Path) -> None:
 
 @pytest.mark.slow
 def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
-    """Seed 1 of every arm fails twice; its unit is split, and so is the one that repeats it."""
-    arms: list[dict[str, Any]] = [{"label": "sauna"}, {"label": "random-drop"}]
+    """Seed 1 of every arm fails twice; its unit is split."""
+    arms: list[dict[str, Any]] = [{"label": "sauna"}, {"label": "sauna+random"}]
     text = {"tasks": ["worlds:Unlucky"], "seeds": 3, "arms": arms, **QUICK}
     lines = [f"{k} = {json.dumps(v)}" for k, v in text.items() if k != "arms"]
     lines += [f"[[arms]]\nlabel = {json.dumps(arm['label'])}" for arm in arms]
@@ -384,11 +371,11 @@ def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "FAILED: worlds:Unlucky, sauna, seed 1" in done.stdout
     results = json.loads((tmp_path / "out" / "unlucky" / "results.json").read_text())
-    sauna_cell, drop_cell = results["cells"]
+    sauna_cell, control_cell = results["cells"]
     assert [m["status"] for m in sauna_cell["members"]] == ["complete", "failed", "complete"]
-    assert [m["status"] for m in drop_cell["members"]] == ["complete", "failed", "complete"]
+    assert [m["status"] for m in control_cell["members"]] == ["complete", "failed", "complete"]
     assert "out of luck" in sauna_cell["members"][1]["error"]
-    assert "drop rates" in drop_cell["members"][1]["error"]
+    assert "out of luck" in control_cell["members"][1]["error"]
     table = json.loads((tmp_path / "out" / "unlucky" / "summary.json").read_text())["table"]
     assert [(row["seeds"], row["failed"]) for row in table] == [(2, 1), (2, 1)]
     page = (tmp_path / "out" / "unlucky" / "report.html").read_text()

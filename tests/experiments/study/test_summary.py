@@ -254,9 +254,12 @@ def test_several_arms_are_corrected_together() -> None:
     assert "The interval leaves out 0.5, but the test, which decides, does not." in both["text"]
 
 
-def test_a_filter_is_compared_with_its_head_only_ablation_and_its_random_control() -> None:
+@pytest.mark.parametrize(
+    "arm, more", [("random-drop", {"rates_of": "sauna"}), ("sauna+random", {})]
+)
+def test_a_filter_is_compared_with_its_head_only_ablation_and_its_random_control(arm, more) -> None:
     """All three beat the baseline; what the head does without it is no merit of the filter."""
-    control = {**cell("control", ALIKE, arm="random-drop", keep_rate=0.7), "rates_of": "sauna"}
+    control = {**cell("control", ALIKE, arm=arm, keep_rate=0.7), **more}
     other = {
         **cell("other control", LOW, arm="random-drop", keep_rate=0.7),
         "rates_of": "elsewhere",
@@ -293,6 +296,29 @@ def test_a_filter_is_compared_with_its_head_only_ablation_and_its_random_control
     assert summarize(results(arms[0], *own))["filtering"] == []
     ruled = {**cell("sauna", HIGH, keep_rate=0.7), "baseline": "ppo, other rules"}
     assert summarize(results(*arms[:2], ruled))["filtering"] == []  # another head, of other rules
+
+
+@pytest.mark.parametrize("stored", ["config", "command"])
+def test_a_control_is_that_of_the_arm_with_its_settings(stored: str) -> None:
+    """Of two thresholds with one control each; the control of 0.3 is of neither."""
+
+    def arm(label: str, name: str, threshold: float) -> dict[str, Any]:
+        config = {"threshold": threshold, "gamma": 0.9, "filter": "sauna", "arm": [name]}
+        config["control"] = "random" if "+" in name else "none"
+        command = f"sauna train X --threshold {threshold} --arm {name} --seeds 0,1"
+        own = {"config": config} if stored == "config" else {"command": command}
+        return {**cell(label, HIGH, arm=name, keep_rate=0.7), **own}
+
+    arms = [arm(f"{value}", "sauna", value) for value in (0.8, 1.0)]
+    controls = [arm(f"{value} random", "sauna+random", value) for value in (1.0, 0.8, 0.3)]
+    head = {**cell("vex-head", LOW), "config": {"gamma": 0.9} if stored == "config" else {}}
+    found = summarize(results(cell("ppo", LOW), *controls, *arms))["filtering"]
+    assert [(v["label"], v["against"]) for v in found] == [
+        ("0.8", "0.8 random"),
+        ("1.0", "1.0 random"),
+    ]
+    found = summarize(results(cell("ppo", LOW), head, *controls))["filtering"]
+    assert found == []  # a control is not credited with a rule
 
 
 def test_a_baseline_that_filtered_nothing_is_named() -> None:

@@ -168,7 +168,10 @@ def _train(
         if iteration == 2:
             steps, clock, timers.calls = 0, time.perf_counter(), 0
             timers.seconds = dict.fromkeys(SECTIONS, 0.0)
-        hypers = [budget.hypers_of(job, p, counters[p], iteration) for p in range(len(keys))]
+        hypers = [
+            budget.hypers_now(one.config, own)
+            for one, own in zip(job.members, counters, strict=True)
+        ]
         limit = np.array([budget.step_limit(job.config, c) for c in counters])
         params = np.stack([np.asarray(state.params) for state in states])
         collected = collector.collect(params, hypers, iteration, limit)

@@ -78,7 +78,13 @@ def examine(
     steps_per_second = frames_per_second(env)
     close(env)
     own = under(name + "/", artifact.checkpoint.arrays)
-    hypers = hypers_of(run, config, everyone.index(member), iteration, own)
+    rows = [
+        row
+        for row in run_directory.rows(run)
+        if row["member"] == name and row["iteration"] < iteration
+    ]
+    trained_keep_rate = rows[-1]["keep_rate"] if rows else None
+    hypers = hypers_of(config, own, trained_keep_rate)
     steps, number = len(played.reward), environments(config)
     seen = [played.observation]
     for n in range(1, number):
@@ -95,11 +101,6 @@ def examine(
     reward = scaled(config, own, played.reward)
     stream = _stream(policy, played, reward, value, decisions.keep)
     points, shares = principal_components(played.observation)
-    rows = [
-        row
-        for row in run_directory.rows(run)
-        if row["member"] == name and row["iteration"] < iteration
-    ]
     return Inspection(
         member=member,
         iteration=iteration,
@@ -112,7 +113,7 @@ def examine(
         environments=number,
         head=config.vex_coef > 0,
         hypers=hypers,
-        trained_keep_rate=rows[-1]["keep_rate"] if rows else None,
+        trained_keep_rate=trained_keep_rate,
         reward=reward,
         value=value,
         advantage=advantages(config, stream, decisions.rollouts, hypers),
@@ -122,12 +123,17 @@ def examine(
 
 
 def hypers_of(
-    run: Path, config: Config, index: int, iteration: int, own: Mapping[str, np.ndarray]
+    config: Config, own: Mapping[str, np.ndarray], trained_keep_rate: float | None
 ) -> Hypers:
-    """Returns the member's traced settings, at the checkpoint's iteration; `own` are its arrays."""
-    rates = run_directory.read_config(run).get("drop_rates") or []
-    counters = Counters.from_arrays(own)
-    return hypers_now(config, rates[index] if rates else [], counters, iteration)
+    """Returns the member's traced settings, at the checkpoint's iteration; `own` are its arrays.
+
+    A random-drop run without a rate is one of 0.1.0 that repeated the rates of another run: its
+    rate is what it dropped in the iteration before.
+    """
+    hypers = hypers_now(config, Counters.from_arrays(own))
+    if config.filter == "random-drop" and not config.drop_rate and trained_keep_rate is not None:
+        return hypers._replace(drop_rate=np.float32(1.0 - trained_keep_rate))  # type: ignore[arg-type]
+    return hypers
 
 
 def scaled(config: Config, own: Mapping[str, np.ndarray], reward: np.ndarray) -> np.ndarray:

@@ -157,6 +157,11 @@ def notes(found: Inspection) -> list[str]:
             f"random-drop: each step is dropped with a chance of "
             f"{found.hypers.drop_rate:.3f}, whatever the head says."
         )
+    if config.control != "none" and config.filter != "none":
+        said.append(
+            f"What the rule keeps is shown. Training took as many other steps, by the control "
+            f"{config.control}."
+        )
     if found.environments > 1:
         said.append(
             f"Decisions look at {found.environments} environments together; environment 0 is shown."

@@ -5,9 +5,8 @@ training), its state coverage (mean over the checkpoints) and the final return, 
 member. Whether one of them follows a constant threshold is tested by rank correlation over members;
 its p value is that of permuting the members' thresholds, corrected by Holm's method for the three
 quantities of a task. A filter that drops more also updates less often in the same env steps: a
-matched random control, which drops as much, shows how much of an effect that is. A control's member
-repeats the drop rates of one member of the filter, so these are compared pair by pair, by
-Student's t.
+matched random control, which drops as much, shows how much of an effect that is. Members of one
+seed begin alike, so these are compared pair by pair, by Student's t.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from sauna.config.presets import RANDOM_CONTROL
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.experiments.measure.measurement import Measurement
@@ -50,7 +50,7 @@ ABOUT = (
     "of arms with a constant threshold, p by permuting their thresholds, after Holm's correction "
     "for the three quantities of a task. Fewer kept steps are also fewer updates in the "
     "same env steps: matched random controls show what that alone does. Differences from a "
-    "control are means over pairs of members with the same drop rates; in brackets 95%, not "
+    "control are means over pairs of members of the same seed; in brackets 95%, not "
     "corrected for their number."
 )
 LOOKS = {
@@ -66,10 +66,10 @@ class Mark(NamedTuple):
 
     kind: str  # of `LOOKS`
     label: str
-    threshold: float  # of a control, that of the arm whose rates it repeats
+    threshold: float  # of a control, that of the arm whose control it is
     seeds: int  # that the arm has, trained and measured or not
     members: dict[str, list[tuple[int, float]]]  # quantity -> (seed, value)
-    drops_like: str | None = None  # of a control, the arm whose drop rates it repeats
+    drops_like: str | None = None  # of a control, the arm whose control it is
 
 
 def report(measured: Mapping[str, Any], folder: Path | None = None) -> Section:
@@ -97,11 +97,10 @@ def check(configs: Sequence[Config]) -> None:
       BadInput
     """
     for config in configs:
-        is_control = config.filter == "random-drop" and config.drop_rate_from
-        if config.filter != "sauna" and not is_control:
+        if config.filter != "sauna":
             raise BadInput(
-                'study: measure = "coverage" is of arms that have a threshold, and of matched '
-                f"random controls, not of {', '.join(config.arm)}"
+                'study: measure = "coverage" is of arms that have a threshold, and of their '
+                f"controls, not of {', '.join(config.arm)}"
             )
         if not config.normalize_observations:
             raise BadInput("normalize_observations: coverage takes its scale from the normaliser")
@@ -130,6 +129,7 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
     Of members that are measured: all of an arm's numbers are of the same ones.
     """
     cells = [cell for cell in measured["cells"] if cell["task"] == task]
+    arms = {_settings(cell): cell["label"] for cell in cells}
     thresholds = {cell["label"]: _threshold(cell) for cell in cells}
     found = []
     for cell in cells:
@@ -141,19 +141,27 @@ def marks(measured: Mapping[str, Any], task: str) -> list[Mark]:
             ]
             for key, *_ in QUANTITIES
         }
-        kind = _kind(cell)
-        is_control = kind == "matched random control"
-        threshold = thresholds.get(cell["rates_of"] if is_control else cell["label"])
+        kind, drops_like = _kind(cell), None
+        if kind == "matched random control":
+            arm = cell["arm"].removesuffix(RANDOM_CONTROL)
+            drops_like = cell.get("rates_of") or arms.get((arm, *_settings(cell)[1:]))
+        threshold = thresholds.get(drops_like or cell["label"])
         if threshold is not None:
-            found.append(
-                Mark(kind, cell["label"], threshold, cell["seeds"], numbers, cell["rates_of"])
-            )
+            found.append(Mark(kind, cell["label"], threshold, cell["seeds"], numbers, drops_like))
     return found
+
+
+def _settings(cell: Mapping[str, Any]) -> tuple[Any, ...]:
+    """The arm and the settings that tell a study's arms apart."""
+    return (cell["arm"], *(cell["config"][name] for name in sorted(cell["config"])))
 
 
 def _threshold(cell: Mapping[str, Any]) -> float | None:
     """An arm's own: where it moves, the mean over members of its median over training."""
-    if _kind(cell) == "constant":
+    if (
+        cell["config"]["threshold_schedule"] == "constant"
+        and not cell["config"]["keep_rate_target"]
+    ):
         return float(cell["config"]["threshold"])
     moved = [m["threshold"] for m in cell["members"] if m.get("threshold") is not None]
     return float(np.mean(moved)) if moved else None
@@ -161,7 +169,7 @@ def _threshold(cell: Mapping[str, Any]) -> float | None:
 
 def _kind(cell: Mapping[str, Any]) -> str:
     config = cell["config"]
-    if cell["arm"] == "random-drop":
+    if cell["arm"] == "random-drop" or cell["arm"].endswith(RANDOM_CONTROL):
         return "matched random control"
     if config["keep_rate_target"]:
         return "target keep rate"

@@ -87,22 +87,21 @@ def load_snapshot(run: Path, name: str, iteration: int) -> MemberSnapshot:
     check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust=False)
     settings = read_stored(loaded.manifest)
     spaces = read_spaces(loaded.manifest["spaces"])
-    config, everyone = settings.config, settings.members
-    place = next((p for p, member in enumerate(everyone) if member.name == name), None)
-    if place is None:
+    config = settings.config
+    member = next((one for one in settings.members if one.name == name), None)
+    if member is None:
         raise BadCheckpoint(f"{loaded.path}: its config has no member {name!r}")
     arrays = under(name + "/", loaded.arrays)
     program = make_program(config, spaces)
     example = program.policy.init(jax.random.key(0))
     params = flat_params(program.policy, example, under("params/", arrays))
     counters = Counters.from_arrays(arrays)
-    rates = stored["drop_rates"][place] if stored.get("drop_rates") else []
-    hypers = hypers_now(everyone[place].config, rates, counters, iteration)
+    hypers = hypers_now(member.config, counters)
     return MemberSnapshot(
         run,
         config,
         spaces,
-        everyone[place],
+        member,
         iteration,
         program,
         params,

@@ -24,6 +24,7 @@ COLOURS = {
     "sauna": "#D55E00",
     "sauna-paper": "#CC79A7",
     "sauna-reference": "#009E73",
+    "sauna+random": "#999999",
 }
 _OTHER_ARMS = ("#56B4E9", "#882255", "#997700", "#4B5563")
 _MARKERS = ("o", "s", "D", "^", "v", "P", "X")  # matplotlib's names; one for each arm

@@ -25,8 +25,9 @@ class Cell(NamedTuple):
     failed: int
     running: int
     waiting: int
-    rates_of: str | None = None  # of a random control, the label whose drop rates it repeats
+    rates_of: str | None = None  # of a control of 0.1.0: the label whose drop rates it repeated
     config: Mapping[str, Any] = MappingProxyType({})  # empty where only numbers were stored
+    command: str = ""  # that trains it
 
     def values(self, name: str) -> np.ndarray:
         """Returns the finite values of a member's entry `name`, over complete members."""

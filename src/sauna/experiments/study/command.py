@@ -193,7 +193,7 @@ def _check_runs(spec: Spec) -> None:
             if key not in found:
                 found[key] = look_at(config)
             try:
-                prepared = examine(placed, arm.checked_overrides(task), found[key])
+                prepared = examine(placed, arm.overrides(task, arm.seeds), found[key])
                 if spec.measurement:
                     spec.measurement.check_spaces(prepared.config, prepared.spaces)
             except BadInput as error:
@@ -320,7 +320,10 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
         if not isinstance(text, dict) or not isinstance(size, int) or size < 1:
             raise BadInput(f"out: {path} is not what a study writes")
         if not covers(spec.text, text) or not _is_same(text, spec):
-            raise BadInput(f"study: {place} holds another study of this name; give --out")
+            raise BadInput(
+                f"study: {place} holds another study of this name; remove it (the runs in units/ "
+                f"stay) or give --out"
+            )
         return size
     return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(first_look(spec), jobs)
 

@@ -263,7 +263,6 @@ def gather_measured(
                     "steps": config["steps"],
                     "baseline": arms[key[1]].baseline,
                     "seeds": len(arms[key[1]].seeds),
-                    "rates_of": arms[key[1]].rates_of,
                     "config": settings,
                     "members": members,
                 }

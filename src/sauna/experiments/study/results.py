@@ -73,15 +73,11 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
     members = [m for unit in units for m in _members(unit, folder, config["steps"])]
     flags = {**arm.settings, "arm": arm.arm, "seeds": arm.seeds}
     text = " ".join(typed(key, value) for key, value in flags.items())
-    if arm.rates_of is not None:
-        config["drop_rate_from"] = f"the runs of {arm.rates_of!r}"
-        text += f" --drop-rate-from RUN  # of {arm.rates_of!r}, the same seeds"
     return {
         "task": task,
         "label": arm.label,
         "arm": arm.arm,
         "baseline": arm.baseline,
-        "rates_of": arm.rates_of,
         "preset": config["preset"],
         "config": config,
         "command": f"sauna train {shlex.quote(task)} {text}",

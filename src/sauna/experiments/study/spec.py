@@ -17,9 +17,9 @@ Any setting of a run may stand at the top, for all arms, or in an arm. `baseline
 others are compared with. `question` is the title of the report. `measure` names what is measured of
 the trained members: `noise` or `coverage` at checkpoints along their training, `posture` (of
 HalfCheetah) at its end, or a `Measurement` of your own as `module:name`. An arm may name its own
-`tasks`, `seeds` and `baseline`; a `random-drop` arm repeats the measured drop rates of the arm
-`rates_of`. With `design = "sequential"` an arm gets more seeds only while it is open, `seeds` at
-most.
+`tasks`, `seeds` and `baseline`. The matched random control of `sauna 0.8` is another arm with its
+settings and `arm = "sauna+random"`. With `design = "sequential"` an arm gets more seeds only while
+it is open, `seeds` at most.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from sauna.config.presets import (
     parse_all,
     resolve_run,
 )
-from sauna.config.settings import FIELDS, Config, fields_with, parse, to_json
+from sauna.config.settings import FIELDS, Config, fields_with, parse
 from sauna.experiments.measure.measurement import (
     Measurement,
     check_measurement,
@@ -57,7 +57,7 @@ _OWN = (*fields_with("decided_by_study"), "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
 _TOP = ("name", "question", "tasks", "seeds", "baseline", "arms", "measure", "design")
 FORMER_STUDIES = {"dial": "threshold-sweep"}  # names in 0.1.0
-_ARM = ("label", "arm", "tasks", "seeds", "baseline", "rates_of")
+_ARM = ("label", "arm", "tasks", "seeds", "baseline")
 
 
 class Arm(NamedTuple):
@@ -69,16 +69,10 @@ class Arm(NamedTuple):
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     baseline: str | None  # the label it is compared with
-    rates_of: str | None  # the label whose drop rates it repeats
 
     def overrides(self, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
         """Gives the settings of a run of some seeds on one task."""
         return {**self.settings, "env": task, "arm": self.arm, "seeds": list(seeds)}
-
-    def checked_overrides(self, task: str) -> dict[str, Any]:
-        """Gives the settings of all seeds, with a stand-in for a source that is not there yet."""
-        source = {"drop_rate_from": "the source"} if self.rates_of is not None else {}
-        return {**self.overrides(task, self.seeds), **source}
 
 
 class Spec(NamedTuple):
@@ -189,7 +183,6 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
         raise BadInput("study: tasks must be a list of environments, each of them once")
     seeds = parse("seeds", entry.get("seeds", top.get("seeds", 6)))
     own = {key: value for key, value in entry.items() if key not in _ARM}
-    optional = {key: _text(entry[key], key) for key in ("baseline", "rates_of") if key in entry}
     return Arm(
         _text(entry.get("label", arm), "label"),
         arm,
@@ -199,8 +192,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
         },
         tuple(_text(task, "tasks") for task in tasks),
         seeds,
-        optional.get("baseline"),
-        optional.get("rates_of"),
+        _text(entry["baseline"], "baseline") if "baseline" in entry else None,
     )
 
 
@@ -226,18 +218,10 @@ def _text(value: Any, key: str) -> str:
 
 
 def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
-    """Fills in what an arm left open: its baseline, and whose drop rates it repeats."""
+    """Fills in the baseline of an arm that names none."""
     known = {other.label: other for other in arms}
-    source = arm.rates_of
-    if arm.arm == "random-drop" and source is None and "drop_rate" not in arm.settings:
-        filtered = [a.label for a in arms if arm_settings(a.arm)["filter"] == "sauna"]
-        if not filtered:
-            raise BadInput("study: random-drop needs a filtered arm whose rates it repeats")
-        source = filtered[0]
-    if source is not None and arm.arm != "random-drop":
-        raise BadInput(f"study: rates_of is read by random-drop only, not by {arm.label!r}")
     own = arm.baseline or (None if arm.label == baseline else baseline)
-    for name in (own, source, baseline):
+    for name in (own, baseline):
         if name is not None and name not in known:
             raise BadInput(f"study: there is no arm {name!r}{nearest(name, known)}")
     if own == arm.label:
@@ -247,25 +231,7 @@ def _settle(arm: Arm, arms: list[Arm], baseline: str) -> Arm:
             f"study: {own!r}, the baseline of {arm.label!r}, is not trained on "
             f"{', '.join(sorted(missing))}"
         )
-    if source is not None:
-        if arm_settings(known[source].arm)["filter"] != "sauna":
-            raise BadInput(f"study: {source!r} does not filter, so it has no drop rates")
-        if set(arm.tasks) - set(known[source].tasks) or arm.seeds != known[source].seeds:
-            raise BadInput(f"study: {source!r} must have the tasks and the seeds of {arm.label!r}")
-        arm = arm._replace(settings={**_rules_of(known[source], arm), **arm.settings})
-    return arm._replace(baseline=own, rates_of=source)
-
-
-def _rules_of(source: Arm, control: Arm) -> dict[str, Any]:
-    """Returns the rules of a filtered arm that its matched random control has to share."""
-    theirs, own = (to_json(arm_config(a.arm, parse_all(a.settings))) for a in (source, control))
-    shared = fields_with("rule_of_experiment")
-    rules = {name: theirs[name] for name in shared if name not in FIXED[control.arm]}
-    return {
-        name: theirs[name]
-        for name in rules
-        if theirs[name] != own[name] and reads(control.arm, {**control.settings, **rules}, name)
-    }
+    return arm._replace(baseline=own)
 
 
 def check(arm: Arm, task: str) -> Config:
@@ -274,13 +240,13 @@ def check(arm: Arm, task: str) -> Config:
 
 
 def resolved(arm: Arm, task: str) -> RunConfig:
-    """Resolves a run of `arm`; a random-drop arm's source is settled later.
+    """Resolves a run of all seeds of `arm`.
 
     Raises:
       BadInput: the settings cannot be used; the label is named.
     """
     try:
-        return resolve_run(arm.checked_overrides(task))
+        return resolve_run(arm.overrides(task, arm.seeds))
     except BadInput as error:
         raise BadInput(f"study, arm {arm.label!r}: {error}") from None
 

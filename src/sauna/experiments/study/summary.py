@@ -31,11 +31,12 @@ from sauna.experiments.study.verdicts import (
     MORE_STEPS,
     UNFILTERED,
     ablations_of,
+    is_random_control,
     verdicts_of,
 )
 from sauna.system.errors import BadInput
 
-__all__ = ["ABLATION", "MORE_STEPS", "UNFILTERED", "summarize"]
+__all__ = ["ABLATION", "MORE_STEPS", "UNFILTERED", "random_controls", "summarize"]
 
 FORMAT = 1
 GRID = 60  # points of a curve at most
@@ -95,6 +96,20 @@ def _as_ranked(table: Any, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, 
     return [{**row, "improvement": ranked.get((row["task"], row["label"]))} for row in table]
 
 
+def random_controls(results: Mapping[str, Any], label: str) -> list[str]:
+    """Lists the labels of the matched random controls of `label`, those of 0.1.0 last."""
+    cells = [_cell(stored, results["baseline"]) for stored in results["cells"]]
+    found = [
+        other
+        for cell in cells
+        if cell.label == label
+        for other in cells
+        if other.task == cell.task and is_random_control(other, cell)
+    ]
+    found.sort(key=lambda other: other.rates_of is not None)
+    return list(dict.fromkeys(other.label for other in found))
+
+
 def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
     own = stored.get("baseline") or (None if stored["label"] == baseline else baseline)
     members = stored["members"]
@@ -118,6 +133,7 @@ def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
         waiting,
         stored.get("rates_of"),
         stored.get("config") or {},
+        stored.get("command") or "",
     )
 
 

@@ -27,8 +27,7 @@ class Unit(NamedTuple):
 
     Attributes:
       name: of its folder.
-      settings: of the run, without the place and the source of drop rates.
-      source: the unit whose measured drop rates it repeats.
+      settings: of the run, without the place.
     """
 
     name: str
@@ -36,7 +35,6 @@ class Unit(NamedTuple):
     label: str
     seeds: tuple[int, ...]
     settings: dict[str, Any]
-    source: str | None
 
     def run(self, folder: Path) -> Path:
         """Returns the run directory."""
@@ -44,10 +42,7 @@ class Unit(NamedTuple):
 
     def overrides(self, folder: Path) -> dict[str, Any]:
         """Gives all settings of the run."""
-        overrides = {**self.settings, "out": str(self.run(folder)), "processes": 1}
-        if self.source is not None:
-            overrides["drop_rate_from"] = str(folder / self.source / "run")
-        return overrides
+        return {**self.settings, "out": str(self.run(folder)), "processes": 1}
 
     def error(self, folder: Path) -> str | None:
         """Returns why it failed for good, or None."""
@@ -59,13 +54,11 @@ class Unit(NamedTuple):
 
 
 def seeds_per_unit(spec: Spec, cores: int) -> int:
-    """Returns as many as share a process well, or fewer where cores would stay idle at the start,
-    when arms that repeat others' drop rates have to wait; as even as can be without another
-    unit."""
-    first = [arm for arm in spec.arms if arm.rates_of is None]
+    """Returns as many as share a process well, or fewer where cores would stay idle; as even as
+    can be without another unit."""
 
     def units(size: int) -> int:
-        return sum(-(-len(arm.seeds) // size) * len(arm.tasks) for arm in first)
+        return sum(-(-len(arm.seeds) // size) * len(arm.tasks) for arm in spec.arms)
 
     most = next((size for size in range(SEEDS, 1, -1) if units(size) >= cores), 1)
     return next(size for size in range(1, SEEDS + 1) if units(size) == units(most))
@@ -77,13 +70,10 @@ def most_seeds(spec: Spec) -> int:
 
 
 def units_of(spec: Spec, size: int) -> list[Unit]:
-    """Returns all units of `size` seeds at most, arm by arm, a source before those that repeat
-    it."""
-    arms = {arm.label: arm for arm in spec.arms}
-    ordered = sorted(spec.arms, key=lambda arm: arm.rates_of is not None)
+    """Returns all units of `size` seeds at most, arm by arm."""
     return [
-        _unit(arms, arm, task, seeds)
-        for arm in ordered
+        _unit(arm, task, seeds)
+        for arm in spec.arms
         for task in arm.tasks
         for seeds in _parts(arm, size)
     ]
@@ -94,13 +84,11 @@ def _parts(arm: Arm, size: int) -> Iterator[tuple[int, ...]]:
         yield arm.seeds[first : first + size]
 
 
-def _unit(arms: dict[str, Arm], arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
-    source = _unit(arms, arms[arm.rates_of], task, seeds).name if arm.rates_of else None
-    settings = arm.overrides(task, seeds)
-    digest = digest_of([RULES, identity(arm, task, seeds), source])
+def _unit(arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
+    digest = digest_of([RULES, identity(arm, task, seeds), None])  # None: as units were named
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in task)
     name = f"{place}_{arm.arm}_{seeds[0]}-{seeds[-1]}_{digest}"
-    return Unit(name, task, arm.label, seeds, settings, source)
+    return Unit(name, task, arm.label, seeds, arm.overrides(task, seeds))
 
 
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
@@ -116,7 +104,7 @@ def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
 def study_identity(spec: Spec) -> list[Any]:
     """Returns everything that a study trains and compares: the same for the same study."""
     return [
-        [arm.label, arm.baseline, arm.rates_of, identity(arm, task, arm.seeds)]
+        [arm.label, arm.baseline, None, identity(arm, task, arm.seeds)]
         for arm in spec.arms
         for task in arm.tasks
     ] + [spec.measure, *(["sequential"] if spec.looks else [])]
@@ -127,16 +115,14 @@ def digest_of(values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:10]
 
 
-def split(unit: Unit, folder: Path) -> list[Unit]:
+def split(unit: Unit) -> list[Unit]:
     """Returns a unit of several seeds as units of one: so that the others go on where one
     failed."""
-    source_is_split = unit.source is not None and _is_split(folder / unit.source)
     return [
         unit._replace(
             name=f"{unit.name}/seed-{seed}",
             seeds=(seed,),
             settings={**unit.settings, "seeds": [seed]},
-            source=f"{unit.source}/seed-{seed}" if source_is_split else unit.source,
         )
         for seed in unit.seeds
     ]
@@ -155,9 +141,4 @@ def _is_split(place: Path) -> bool:
 def parts(unit: Unit, folder: Path) -> list[Unit]:
     """Returns the units that hold the runs: the unit itself, or one per seed where it was split."""
     is_split = _is_split(folder / unit.name) and not unit.is_complete(folder)
-    return split(unit, folder) if is_split else [unit]
-
-
-def needs_split(unit: Unit, folder: Path) -> bool:
-    """Returns whether its source was split, so that it has to follow."""
-    return len(unit.seeds) > 1 and unit.source is not None and _is_split(folder / unit.source)
+    return split(unit) if is_split else [unit]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sauna.config.controls import rule_of
-from sauna.config.presets import arm_settings
+from sauna.config.presets import RANDOM_CONTROL, arm_settings
 from sauna.config.settings import Config
 from sauna.experiments.statistics import ALPHA, POWER, Comparison, compare
 from sauna.experiments.study.cells import MAX_FAILED, Cell, is_control_among
@@ -20,6 +20,7 @@ FILTERS_OWN = (
     "out",
     "processes",
     "filter",
+    "control",
     "threshold",
     "threshold_schedule",
     "keep_rate_target",
@@ -30,6 +31,7 @@ FILTERS_OWN = (
     "drop_rate",
     "drop_rate_from",
 )
+# Settings that an arm and its control may differ in.
 CONTROLS_OWN = ("arm", "seeds", "out", "processes", "control")
 UNFILTERED = 0.99  # mean keep rate from which a difference is not credited to filtering
 MORE_STEPS = 0.01  # relative difference in env steps from which it is mentioned
@@ -77,7 +79,12 @@ def ablations_of(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
         f"{cell.label} - {other.label}": (cell, other)
         for cell in cells
         for other in cells
-        if _is_control(other, cell)
+        if is_random_control(other, cell)
+        or (
+            _settings(cell.arm).get("filter") == "sauna"
+            and not _is_controlled(cell)
+            and _is_head_alone(other, cell)
+        )
     }
     found = compare(
         {name: (cell.scores(), other.scores()) for name, (cell, other) in pairs.items()}
@@ -86,17 +93,42 @@ def ablations_of(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
     return [_verdict(*pairs[name], comparison, family, tasks) for name, comparison in found.items()]
 
 
-def _is_control(other: Cell, cell: Cell) -> bool:
-    """Whether `other` is the matched random control or the head-only ablation of `cell`.
+def is_random_control(other: Cell, cell: Cell) -> bool:
+    """Whether `other` is the matched random control of `cell`: the same settings but the control.
+
+    One of 0.1.0 repeated the measured drop rates of the runs of `cell` instead.
+    """
+    if other.rates_of is not None:
+        return other.rates_of == cell.label
+    if other.arm != cell.arm + RANDOM_CONTROL:
+        return False
+    if cell.config and other.config:
+        names = (set(cell.config) | set(other.config)) - set(CONTROLS_OWN)
+        return all(cell.config.get(name) == other.config.get(name) for name in names)
+    return _typed(cell.command) == _typed(other.command)
+
+
+def _typed(command: str) -> list[str]:
+    """The settings in a command, but for the arm and the seeds."""
+    words = shlex.split(command, comments=True)
+    return [
+        word
+        for before, word in zip(["", *words], words, strict=False)
+        if not {before, word} & {"--arm", "--seeds"}
+    ]
+
+
+def _is_controlled(cell: Cell) -> bool:
+    """Whether a control replaces what the arm's rule takes."""
+    control = cell.config.get("control") or _settings(cell.arm).get("control", "none")
+    return bool(control != "none")
+
+
+def _is_head_alone(other: Cell, cell: Cell) -> bool:
+    """Whether `other` is the head-only ablation of `cell`.
 
     Without stored settings an arm's name says what its rules are.
     """
-    if rule_of(other.arm) == cell.arm and _same_rules(other, cell):
-        return True
-    if _settings(cell.arm).get("filter") != "sauna":
-        return False
-    if other.rates_of == cell.label:
-        return True
     if other.arm != "vex-head" or cell.baseline is None or other.baseline != cell.baseline:
         return False
     if cell.config and other.config:

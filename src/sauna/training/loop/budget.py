@@ -10,7 +10,7 @@ import numpy as np
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.types import Array, Hypers
 from sauna.config.settings import Config
-from sauna.training.loop.job import Job, Setting
+from sauna.training.loop.job import Setting
 from sauna.training.loop.member_state import Counters
 
 
@@ -29,28 +29,11 @@ def step_limit(config: Config, counters: Counters) -> int:
     return min(capacity(config), (config.steps - counters.env_steps) // config.envs)
 
 
-def hypers_of(job: Job, p: int, counters: Counters, iteration: int) -> Hypers:
-    """Computes the traced hyperparameters of the job's member `p` in this iteration."""
-    rates = job.drop_rates[p] if job.drop_rates else []
-    return hypers_now(job.members[p].config, rates, counters, iteration)
-
-
-def hypers_now(
-    member_config: Config, drop_rates: list[float], counters: Counters, iteration: int
-) -> Hypers:
-    """Computes a member's traced hyperparameters in this iteration.
-
-    Args:
-      member_config: its arm's.
-      drop_rates: of each iteration; empty: the config's constant one.
-    """
+def hypers_now(member_config: Config, counters: Counters) -> Hypers:
+    """Computes the traced hyperparameters of a member, of whose budget `counters` are used."""
     used = counters.kept_steps if member_config.budget == "kept" else counters.env_steps
     left = 1.0 - used / member_config.steps
-    rate = member_config.drop_rate
-    if drop_rates:
-        rate = drop_rates[min(iteration, len(drop_rates) - 1)]
     values = {name: getattr(member_config, name) for name in Hypers._fields}
-    values["drop_rate"] = rate
     values["threshold"] = scheduled(member_config.threshold, member_config.threshold_schedule, left)
     if member_config.learning_rate_schedule == "linear":
         values["learning_rate"] = member_config.learning_rate * left
@@ -64,12 +47,10 @@ def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
     ]
 
 
-def device_hypers(config: Config, setting: Setting, used: Array, iteration: Array) -> Hypers:
-    """Computes a member's hyperparameters in this iteration, from `setting` and what is `used`."""
+def device_hypers(config: Config, setting: Setting, used: Array) -> Hypers:
+    """Computes a member's hyperparameters from `setting`, when `used` steps of its budget are."""
     left, rate = 1.0 - used.astype(jnp.float32) / setting.steps, setting.hypers.learning_rate
-    rates = setting.drop_rates
     return setting.hypers._replace(
         learning_rate=rate * left if config.learning_rate_schedule == "linear" else rate,
         threshold=scheduled(setting.hypers.threshold, config.threshold_schedule, left),
-        drop_rate=rates[jnp.minimum(iteration, len(rates) - 1)],
     )

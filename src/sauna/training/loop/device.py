@@ -108,21 +108,14 @@ def _settings(job: Job) -> str:
     """Writes what must be alike on machines that train together."""
     blank = dict.fromkeys(fields_with("machine_local"), "")
     members = [{**to_json(member.config), **blank} for member in job.members]
-    rates = list(job.drop_rates)
-    return json.dumps([{**to_json(job.config), **blank}, members, rates, versions()])
+    return json.dumps([{**to_json(job.config), **blank}, members, versions()])
 
 
 def make_population(job: Job) -> Population:
     """The job's members at the start of their training."""
     config = job.config
     env = flat(make_jax_env(config.env, job.env_kwargs), config.rescale_actions)
-    longest = max((len(rates) for rates in job.drop_rates), default=1)
-    settings = [
-        _setting(
-            member, job.drop_rates[p] if job.drop_rates else [member.config.drop_rate], longest
-        )
-        for p, member in enumerate(job.members)
-    ]
+    settings = [_setting(member) for member in job.members]
     devices = _devices(config)
     mesh = make_mesh(len(settings), config.envs, devices)
     if config.distributed:
@@ -144,12 +137,10 @@ def _devices(config: Config) -> list[Any]:
     return found[:wanted] if wanted else found
 
 
-def _setting(member: Member, drop_rates: list[float], length: int) -> Setting:
+def _setting(member: Member) -> Setting:
     values = {name: np.float32(getattr(member.config, name)) for name in Hypers._fields}
-    rates = drop_rates + [drop_rates[-1]] * (length - len(drop_rates))
     hypers = Hypers(**values)  # type: ignore[arg-type]
-    steps = jnp.int32(member.config.steps)
-    return Setting(member_keys(member.seed), hypers, jnp.asarray(rates, jnp.float32), steps)
+    return Setting(member_keys(member.seed), hypers, jnp.int32(member.config.steps))
 
 
 def _report(

@@ -100,7 +100,7 @@ def iterate(
     if config.budget == "env":
         limit = jnp.minimum(limit, (setting.steps - used) // config.envs)
     limit = jnp.where(has_budget, limit, 0)
-    hypers = device_hypers(config, setting, used, iteration)
+    hypers = device_hypers(config, setting, used)
     collected, rollout, ends, faults = collect(
         parts.collecting,
         state.learner.params,

@@ -24,7 +24,7 @@ from sauna.config.presets import Member
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
-from sauna.training.loop.budget import budget_left, hypers_of, step_limit
+from sauna.training.loop.budget import budget_left, hypers_now, step_limit
 from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
 from sauna.training.loop.member_state import Counters, pack_member, unpack_member
 from sauna.training.loop.metrics import metrics_row
@@ -51,7 +51,9 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
         iteration = job.start
         while any(budget_left(config, c) for c in counters) and reporter.allowance(iteration):
             clock, cpu = time.perf_counter(), time.process_time()
-            hypers = [hypers_of(job, p, counters[p], iteration) for p in range(len(members))]
+            hypers = [
+                hypers_now(one.config, own) for one, own in zip(members, counters, strict=True)
+            ]
             limit = np.array([step_limit(config, c) for c in counters])
             params = np.stack([np.asarray(state.params) for state in states])
             collected = collector.collect(params, hypers, iteration, limit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -44,7 +44,6 @@ class Job(NamedTuple):
     spaces: Spaces
     env_kwargs: dict[str, Any]
     members: list[Member]
-    drop_rates: Sequence[list[float]] = ()  # per member and iteration; empty: the constant rate
     restored: Mapping[str, np.ndarray] | None = None  # a checkpoint's arrays; None: start afresh
     start: int = 0  # the first iteration to run
     replay: bool = True  # whether environments can be brought back by replaying
@@ -65,5 +64,4 @@ class Setting(NamedTuple):
 
     keys: Keys
     hypers: Hypers  # with the learning rate before its schedule
-    drop_rates: Array  # [I] of each iteration; the last counts for all later ones
     steps: Array  # [] int32, the budget

@@ -7,11 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from sauna.experiments.study.units import Unit, mark_split, needs_split, parts, split
+from sauna.experiments.study.units import Unit, mark_split, parts, split
 from sauna.system import run_directory
 
 ATTEMPTS = 2  # a failed unit is continued once
-NO_RATES = "the arm whose drop rates it repeats failed"
 
 
 class View(Protocol):
@@ -48,8 +47,6 @@ class Executor(ABC):
     def run(self, units: list[Unit]) -> None:
         """Runs every unit that is neither complete nor failed; returns when all are, or stopped."""
         everything = [part for unit in units for part in parts(unit, self._folder)]
-        for unit in everything:
-            self._forgive(unit)
         self._waiting = [unit for unit in everything if not self._is_over(unit)]
         try:
             while self._waiting or self._running:
@@ -85,7 +82,7 @@ class Executor(ABC):
         return unit.is_complete(self._folder) or unit.error(self._folder) is not None
 
     def _fill(self) -> None:
-        """Starts units until every job has one, or none is ready."""
+        """Starts units until every job has one, or none waits."""
         waiting = self._waiting
         for unit in list(waiting):
             if len(self._running) >= self._jobs:
@@ -94,27 +91,11 @@ class Executor(ABC):
                 continue
             if self._is_over(unit):
                 waiting.remove(unit)
-            elif needs_split(unit, self._folder):
-                self._split(unit)
-            elif self._source_failed(unit):
-                waiting.remove(unit)
-                self._give_up(unit, NO_RATES)
-            elif unit.source is None or self._is_ready(unit.source):
+            else:
                 waiting.remove(unit)
                 self._running[unit.name] = unit
                 self._view.started(unit)
                 self._start(unit)
-
-    def _is_ready(self, source: str) -> bool:
-        return run_directory.is_complete(self._folder / source / "run")
-
-    def _source_failed(self, unit: Unit) -> bool:
-        return unit.source is not None and (self._folder / unit.source / "failed.json").exists()
-
-    def _forgive(self, unit: Unit) -> None:
-        """Lets a matched random control try again if its source no longer counts as failed."""
-        if unit.error(self._folder) == NO_RATES and not self._source_failed(unit):
-            (self._folder / unit.name / "failed.json").unlink()
 
     def _end(self, name: str, error: str) -> None:
         """A unit is no longer running; `error` says why, if it is not complete."""
@@ -128,9 +109,7 @@ class Executor(ABC):
                 self._waiting.insert(0, unit)
             elif len(unit.seeds) > 1:
                 self._split(unit)
-                self._attempts |= dict.fromkeys(
-                    (single.name for single in split(unit, self._folder)), ATTEMPTS - 1
-                )
+                self._attempts |= {single.name: ATTEMPTS - 1 for single in split(unit)}
             else:
                 self._give_up(unit, error)
 
@@ -139,7 +118,7 @@ class Executor(ABC):
         waiting = self._waiting
         mark_split(unit, self._folder)
         place = waiting.index(unit) if unit in waiting else 0
-        waiting[place:place] = split(unit, self._folder)
+        waiting[place:place] = split(unit)
         waiting[:] = [other for other in waiting if other.name != unit.name]
 
     def _give_up(self, unit: Unit, error: str) -> None:

@@ -206,7 +206,7 @@ class RayExecutor(Executor):
             self._view.progress(unit, message)
 
     def _begin(self, unit: Unit) -> None:
-        """Sends a task what it begins with: the unit's files, or what a new run needs."""
+        """Sends a task what it begins with: the files of the unit that there are."""
         place = self._folder / unit.name
         files = None
         if not self._stopping():
@@ -215,10 +215,6 @@ class RayExecutor(Executor):
                 iteration = int((ray_files.checkpoints(place) or ["0"])[-1])
                 text = f"its node or process was lost; continues from iteration {iteration}"
                 self._view.progress(unit, {"said": text})
-            if unit.source is not None and "run/config.json" not in files:
-                source = self._folder / unit.source / "run"
-                needed = ("config.json", "metrics.jsonl", "summary.json")
-                files |= {f"source/{name}": (source / name).read_bytes() for name in needed}
         self._began.add(unit.name)
         self._hub.answer.remote(unit.name, files)
 

@@ -108,10 +108,9 @@ def run_unit(hub: Any, name: str, overrides: dict[str, Any], git: str | None) ->
     with tempfile.TemporaryDirectory(prefix="sauna-", ignore_cleanup_errors=True) as folder:
         place = Path(folder)
         write(place, files)
-        recorded = {key: overrides[key] for key in ("out", "drop_rate_from") if key in overrides}
-        here = {"out": str(place / "run"), "drop_rate_from": str(place / "source")}
-        unit = overrides | {key: here[key] for key in recorded}
-        unit["elsewhere"] = {"recorded": {**recorded, "git": git}, "folder": folder}
+        unit = overrides | {"out": str(place / "run")}
+        recorded = {"out": overrides["out"], "git": git}
+        unit["elsewhere"] = {"recorded": recorded, "folder": folder}
         return _train(place, unit, lambda *said: ray.get(hub.say.remote(name, attempt, *said)))
 
 
