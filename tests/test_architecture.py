@@ -35,6 +35,7 @@ FLOORS = (
     "training.display",
     "training.tensorboard",
     "training.run",
+    "training.empty_updates",
     "training.coordinator",
     "training.train",
     "training",

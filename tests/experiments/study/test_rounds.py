@@ -11,6 +11,7 @@ import pytest
 
 from helpers import SMALL
 from sauna.api import compare
+from sauna.config.presets import COMPARED
 from sauna.experiments.sequential import DESIGN, capped, replay, tournament
 from sauna.experiments.study.command import (
     chosen_arms,
@@ -30,12 +31,11 @@ RETURNS = {"ppo": 0.0, "gigaflow": 100.0, "gigaflow+random": -0.5, "spo": -100.0
 
 
 def spec_of(*rules: str, **settings: Any) -> Spec:
-    arms, is_tournament = chosen_arms(("all",) if not rules else _DEFAULT, rules, True, settings)
+    arms, is_tournament = chosen_arms(("all",) if not rules else COMPARED, rules, True, settings)
     return comparison("A-v0", arms, settings, is_tournament)
 
 
 QUICK = {key: value for key, value in SMALL.items() if key not in ("seeds", "steps")}
-_DEFAULT = ("ppo", "vex-head", "random-drop", "sauna")
 
 
 def returns(label: str, seed: int) -> float:
@@ -282,12 +282,12 @@ def test_a_tournament_and_a_fixed_design_of_the_same_arms_are_two_studies() -> N
 def test_arms_and_rules_on_the_command_line() -> None:
     arms, is_tournament = chosen_arms(("all",), (), True, {})
     assert is_tournament and arms[0] == "ppo" and {"gigaflow", "gigaflow+random", "spo"} < {*arms}
-    assert chosen_arms(_DEFAULT, ("spo",), True, {}) == (("ppo", "spo"), True)
+    assert chosen_arms(COMPARED, ("spo",), True, {}) == (("ppo", "spo"), True)
     assert chosen_arms(("ppo", "pods"), (), True, {}) == (("ppo", "pods", "pods+random"), False)
     assert chosen_arms(("ppo", "pods"), (), False, {}) == (("ppo", "pods"), False)
     with pytest.raises(BadInput, match="give --rules or --arms, not both"):
         chosen_arms(("ppo", "pods"), ("spo",), True, {})
-    command = compare_command("A-v0", _DEFAULT, {}, "runs", ("spo", "espo"), False)
+    command = compare_command("A-v0", COMPARED, {}, "runs", ("spo", "espo"), False)
     assert command == "sauna compare A-v0 --rules spo,espo --no-controls"
 
 
