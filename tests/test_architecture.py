@@ -36,6 +36,7 @@ FLOORS = (
     "training.tensorboard",
     "training.empty_updates",
     "training.run",
+    "training.empty_updates",
     "training.coordinator",
     "training.train",
     "training",

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 from sauna.config.checks import check_rules
-from sauna.config.presets import CONTROLS, arm_config, arm_settings, parse_all
+from sauna.config.presets import CONTROLS, RANDOM_CONTROL, arm_config, arm_settings, parse_all
 from sauna.system.errors import BadInput
 
 
@@ -23,7 +23,7 @@ def control_of(arm: str, given: Mapping[str, Any] = MappingProxyType({})) -> str
     """
     if rule_of(arm) is not None or given.get("control", "none") != "none":
         return None
-    control = f"{arm}+random"
+    control = arm + RANDOM_CONTROL
     try:
         check_rules(arm_config(control, parse_all(given)))
     except BadInput:

@@ -31,12 +31,11 @@ RETURNS = {"ppo": 0.0, "gigaflow": 100.0, "gigaflow+random": -0.5, "spo": -100.0
 
 
 def spec_of(*rules: str, **settings: Any) -> Spec:
-    arms, is_tournament = chosen_arms(("all",) if not rules else _DEFAULT, rules, True, settings)
+    arms, is_tournament = chosen_arms(("all",) if not rules else COMPARED, rules, True, settings)
     return comparison("A-v0", arms, settings, is_tournament)
 
 
 QUICK = {key: value for key, value in SMALL.items() if key not in ("seeds", "steps")}
-_DEFAULT = COMPARED
 
 
 def returns(label: str, seed: int) -> float:
@@ -178,6 +177,18 @@ def test_the_summary_ranks_the_arms_and_says_who_stopped_why(tmp_path: Path) -> 
     assert '<section id="ranking">' in page and "Learning curves by samples learned from" in page
 
 
+def test_a_stopped_tournament_says_what_is_open(tmp_path: Path) -> None:
+    spec = spec_of("gigaflow", "spo")
+    folder, place = tmp_path / "units", tmp_path / spec.name
+    place.mkdir()
+    for unit in next_round(spec, 3, folder).units[:2]:  # of ppo and gigaflow, not of its control
+        train(unit, folder)
+    summary = write(spec, next_round(spec, 3, folder).units, folder, place, "sauna compare")
+    assert {(row["seeds"], row["verdict"]) for row in summary["ranking"]} == {(0, "open")}
+    assert "its first seeds have not ended" in "\n".join(lines(summary))
+    assert "still open: gigaflow and spo" in (place / "report.html").read_text().lower()
+
+
 def test_compute_is_carried_from_the_runs_to_the_verdict(tmp_path: Path) -> None:
     """Gigaflow takes half of ppo's samples in each iteration and ends 100 above it: at 300 and
     its first third of 207.5 is passed on the way."""
@@ -271,12 +282,12 @@ def test_a_tournament_and_a_fixed_design_of_the_same_arms_are_two_studies() -> N
 def test_arms_and_rules_on_the_command_line() -> None:
     arms, is_tournament = chosen_arms(("all",), (), True, {})
     assert is_tournament and arms[0] == "ppo" and {"gigaflow", "gigaflow+random", "spo"} < {*arms}
-    assert chosen_arms(_DEFAULT, ("spo",), True, {}) == (("ppo", "spo"), True)
+    assert chosen_arms(COMPARED, ("spo",), True, {}) == (("ppo", "spo"), True)
     assert chosen_arms(("ppo", "pods"), (), True, {}) == (("ppo", "pods", "pods+random"), False)
     assert chosen_arms(("ppo", "pods"), (), False, {}) == (("ppo", "pods"), False)
     with pytest.raises(BadInput, match="give --rules or --arms, not both"):
         chosen_arms(("ppo", "pods"), ("spo",), True, {})
-    command = compare_command("A-v0", _DEFAULT, {}, "runs", ("spo", "espo"), False)
+    command = compare_command("A-v0", COMPARED, {}, "runs", ("spo", "espo"), False)
     assert command == "sauna compare A-v0 --rules spo,espo --no-controls"
 
 

@@ -352,6 +352,17 @@ def test_words_and_intervals_agree_on_random_studies() -> None:
     assert kinds == {"better", "worse", "no evidence", "underpowered"}
 
 
+def test_a_control_takes_nothing_from_the_rules_tests() -> None:
+    """Negative control: a second rule does."""
+    rules = [cell("ppo", LOW), cell("gigaflow", HIGH)]
+
+    def said(*more: dict[str, Any]) -> str:
+        return summarize(results(*rules, *more))["verdicts"][0]["text"]
+
+    assert said() == said(cell("gigaflow+random", ALIKE))
+    assert "Holm's correction for 2 arms" in said(cell("pods", ALIKE))
+
+
 def test_table_by_hand() -> None:
     summary = summarize(results(cell("ppo", LOW), cell("sauna", HIGH, keep_rate=0.5)))
     ppo, sauna = summary["table"]

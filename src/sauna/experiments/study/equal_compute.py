@@ -17,7 +17,7 @@ ABOUT = (
     "percentile bootstrap over seeds, too narrow with few of them; no verdict rests on it. CPU "
     "seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
-WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "CPU seconds of the learner"}
+WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "learner CPU seconds"}
 
 
 def curves_over(cell: Cell, axis: str) -> Curves | None:
@@ -74,8 +74,8 @@ def _text(cell: Cell, base: Cell, ratios: dict[str, Ratio]) -> str:
     if all(ratio.value is None for ratio in ratios.values()):
         return f"{cell.label}: does not reach {goal}."
     said = [
-        _share(ratio, f"{whose} {WORDS[axis]}")
-        for (axis, ratio), whose in zip(ratios.items(), (f"{base.label}'s", "its"), strict=False)
+        _share(ratio, f"{base.label}'s {WORDS[axis]}")
+        for axis, ratio in ratios.items()
         if ratio.value is not None
     ]
     return f"{cell.label}: reaches {goal} with {' and '.join(said)}."

@@ -144,7 +144,7 @@ def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
     for baseline in dict.fromkeys(cell.baseline for cell in cells if cell.baseline):
         base = scores.get(baseline, np.zeros(0))
         family = [cell for cell in cells if cell.baseline == baseline]
-        # A control answers another question, and takes nothing from the rules' tests.
+        # Controls are a family of their own: they take nothing from the rules' tests.
         for is_control in (False, True):
             asked = [c.label for c in family if is_control_among(c, cells) == is_control]
             found |= compare({label: (scores[label], base) for label in asked})

@@ -57,11 +57,10 @@ def verdicts_of(
     for label, comparison in found.items():
         cell = of_label[label]
         absent = Cell(cell.task, str(cell.baseline), "", None, [], 0, 0, 0)
-        if is_control_among(cell, cells):  # compared with its rule
-            continue
         base = of_label.get(str(cell.baseline), absent)
+        is_control = is_control_among(cell, cells)
         family = sum(
-            other.baseline == cell.baseline and not is_control_among(other, cells)
+            other.baseline == cell.baseline and is_control_among(other, cells) == is_control
             for other in cells
         )
         verdicts.append(_verdict(cell, base, comparison, _family(family, "arms"), tasks))
