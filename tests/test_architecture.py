@@ -40,6 +40,8 @@ FLOORS = (
     "training",
     "experiments.curves",
     "experiments.statistics",
+    "experiments.compute",
+    "experiments.sequential",
     "experiments.report",
     "experiments.evaluate",
     "experiments.measure",

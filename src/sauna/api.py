@@ -108,7 +108,9 @@ def train_and_draw(run: runs.Run, display: Display, *, resume: bool, inexact: bo
 def compare(
     env: Any,
     *,
-    arms: Sequence[str] = COMPARED,
+    arms: Sequence[str] | str = COMPARED,
+    rules: Sequence[str] = (),
+    controls: bool = True,
     out: str | Path = "runs",
     processes: int = 0,
     quiet: bool = False,
@@ -121,7 +123,9 @@ def compare(
 
     Args:
       env: a Gymnasium id, `module:function`, or a function that another process can import.
-      arms: what to compare; the first is the baseline.
+      arms: what to compare; the first is the baseline. `"all"`: a tournament of every rule.
+      rules: a tournament of ppo and these instead: more seeds only where something is open.
+      controls: each arm that chooses samples gets its matched random control.
       out: the folder of runs and results.
       processes: trainings at a time; 0: one per core.
       quiet: show nothing.
@@ -135,7 +139,7 @@ def compare(
     Raises:
       BadInput: something is not usable; nothing was created.
     """
-    from sauna.experiments.study.command import compare_command, comparison, study
+    from sauna.experiments.study.command import chosen_arms, compare_command, comparison, study
 
     overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
     for name in PARTS:
@@ -143,8 +147,10 @@ def compare(
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
     task = overrides.pop("env")
     overrides = translate(overrides)
-    spec = comparison(task, tuple(arms), parse_all(overrides))
-    command = compare_command(task, tuple(arms), overrides, out)
+    arms, parsed = (arms,) if isinstance(arms, str) else tuple(arms), parse_all(overrides)
+    chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
+    spec = comparison(task, chosen, parsed, is_tournament)
+    command = compare_command(task, arms, overrides, out, rules, controls)
     accept = accept_changed_code
     return study(spec, Path(out), command, processes, quiet=quiet, accept_changed_code=accept)
 

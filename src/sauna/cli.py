@@ -129,7 +129,11 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
     text = f"what to compare; the first is the baseline (default {arms})"
-    compare.add_argument("--arms", default=arms, help=text)
+    compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
+    text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
+    compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
+    text = "add no matched random control to the arms that choose samples"
+    compare.add_argument("--no-controls", action="store_false", dest="controls", help=text)
     free = [n for n in FIELDS if n not in (*fields_with("decided_by_study"), "arm")]
     filtered = {**shown_values(arguments, "sauna"), "seeds": COMPARED_SEEDS}
     add_fields(compare, free, filtered)
@@ -318,7 +322,7 @@ def _inspect(values: dict[str, Any]) -> None:
 
 def _compare(values: dict[str, Any]) -> None:
     from sauna.experiments.report.sources import is_source
-    from sauna.experiments.study.command import compare_command, comparison
+    from sauna.experiments.study.command import chosen_arms, compare_command, comparison
     from sauna.experiments.study.existing import compare_existing
 
     names, tag = values.pop("env"), values.pop("tag")
@@ -326,12 +330,15 @@ def _compare(values: dict[str, Any]) -> None:
         print("\n".join(compare_existing([*map(Path, names)], tag, **values)))
         return
     env, arms = names[0] if names else "", tuple(values.pop("arms").split(","))
+    rules, controls = tuple(filter(None, values.pop("rules").split(","))), values.pop("controls")
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
     values = translate(values)
-    spec = comparison(env, arms, parse_all(values))
-    _run_study(spec, compare_command(env, arms, values, place["out"]), **place)
+    parsed = parse_all(values)
+    chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
+    spec = comparison(env, chosen, parsed, is_tournament)
+    _run_study(spec, compare_command(env, arms, values, place["out"], rules, controls), **place)
 
 
 def _plot(values: dict[str, Any]) -> None:

@@ -97,7 +97,8 @@ def test_a_comparison_that_is_killed_goes_on_to_the_same_bytes(
     env, own = BACKENDS[backend]
     settings = {**SETTINGS, **own, "steps": 32 * 400}
     del settings["arm"]
-    command = ["compare", env, "--arms=ppo,sauna", *(f"--{k}={v}" for k, v in settings.items())]
+    command = ["compare", env, "--arms=ppo,sauna", "--no-controls"]
+    command += [f"--{k}={v}" for k, v in settings.items()]
 
     def start(out: Path) -> Started:
         return Started([*command, "--out", str(out)], out.with_suffix(".log"))

@@ -37,7 +37,7 @@ from sauna.training.loop.device_program import (
     Report,
     init_member,
     iterate,
-    make_parts,
+    make_iteration,
     several,
 )
 
@@ -172,7 +172,7 @@ class OnDevice:
         self._setting = _setting(self._member, [0.0], 1)
 
         def begin(poison: Poison) -> tuple[Parts, MemberState]:
-            parts = make_parts(config, spaces, flat(poisoned(poison)), lambda here: here)
+            parts = make_iteration(config, spaces, flat(poisoned(poison)), lambda here: here)
             return parts, init_member(parts, self._setting)
 
         def run(poison: Poison) -> Report:

@@ -261,7 +261,10 @@ def wrong_on_device(rng: random.Random) -> Mistake:
     after_imports = [
         Mistake(["train", walk, "--env-processes=1"], "env_processes: not read"),
         Mistake(["train", WORLD, "--backend=device"], "backend: worlds:Scripted is not"),
-        Mistake(["train", "CartPole-v1", "--backend=device"], "backend: CartPole-v1 has no face"),
+        Mistake(
+            ["train", "CartPole-v1", "--backend=device"],
+            "CartPole-v1 does not run on the device",
+        ),
         Mistake(["train", walk, "--devices=2"], "devices: 1 members of 1 environments cannot be"),
         Mistake(["train", f"jax_worlds:{typo('unlucky', rng)}"], "did you mean 'unlucky'?"),
         Mistake(["train", walk, "--network=nature-cnn"], "network: nature-cnn does not fit"),

@@ -95,7 +95,7 @@ def test_the_command_line_shows_the_users_frames(tmp_path: Path) -> None:
         env=environment(),
     )
     *frames, line = done.stderr.splitlines()
-    assert done.returncode == 2 and line.startswith("sauna: a part of your own cannot be used")
+    assert done.returncode == 2 and line.startswith("sauna: network: mine:Network cannot be used")
     assert (
         "return helper()" in "\n".join(frames)
         and frames[-1] == "ZeroDivisionError: division by zero"

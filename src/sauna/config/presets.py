@@ -169,9 +169,7 @@ STAGES = ("collect", "rollout", "epoch", "loss", "stop", "critic")
 # What `sauna list rules` shows: `stage: sentence`.
 RULE_HELP = {
     "sauna": "collect: keep a step if its predicted explained variance is informative (eq. 7)",
-    **{
-        name: text for name, text in ARM_HELP.items() if ": " in text and not name.startswith("ppo")
-    },
+    **{name: text for name, text in ARM_HELP.items() if text.split(": ")[0] in STAGES},
 }
 CONTROL_HELP = {
     "random": "control: as many samples as the rule takes in each iteration, at random",

@@ -34,6 +34,7 @@ POWER = 0.8  # of the test that `seeds_needed` plans
 RESAMPLES = 10_000
 SEED = 0
 QUANTILES = (ALPHA / 2, 1 - ALPHA / 2)
+MAX_FAILED = 0.25  # share of an arm's ended seeds that may fail before there is no verdict
 EXACT_UP_TO = 100  # runs in both arms together, up to which p values are exact
 
 

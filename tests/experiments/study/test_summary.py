@@ -34,6 +34,7 @@ ROW = {
     "keep_rate",
     "env_steps",
     "kept_steps",
+    "samples_backward",
     "improvement",
 }
 

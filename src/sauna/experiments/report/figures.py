@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.experiments.compute import AXES
 from sauna.experiments.report import style
 
 Numbers = list[float | None]
@@ -156,6 +157,28 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
         )
     )
     return [plot for plot in plots if any(panel.lines for panel in plot.panels)]
+
+
+def compute_plots(summary: Mapping[str, Any]) -> list[Plot]:
+    """Returns the learning curves over compute, of what was recorded."""
+    plots = []
+    for axis, name in AXES.items():
+        panels = [
+            Panel(
+                task,
+                [
+                    Line(label, c["x"], c["mean"], c["low"], c["high"], [])
+                    for label, c in of_axis.get(axis, {}).items()
+                    if _any(c["mean"])
+                ],
+            )
+            for task, of_axis in summary.get("by_compute", {}).items()
+        ]
+        if any(panel.lines for panel in panels):
+            caption = f"{TRAINING_RETURN} By {name}; a seed that has ended keeps its last return."
+            title = f"Learning curves by {name}"
+            plots.append(Plot(f"by_{axis}", title, caption, name, "return", None, panels))
+    return plots
 
 
 def looks_of(results: Mapping[str, Any]) -> dict[str, style.Look]:
@@ -312,6 +335,8 @@ def _label_axes(axes: Any, plot: Plot, panel: Panel) -> None:
     axes.set_xlabel(plot.x_label)
     if plot.x_label == "env steps":
         style.count_steps(axes)
+    elif plot.x_label in AXES.values():
+        axes.xaxis.set_major_formatter(style.short)
     if plot.limits:
         low, high = plot.limits
         margin = 0.02 * (high - low)

@@ -178,8 +178,9 @@ def save(figure: Any, path: Path) -> Path:
 def as_svg(figure: Any) -> bytes:
     """Draws a figure as SVG; its bytes depend on what it shows alone.
 
-    Coordinates keep two decimals of a point, which halves a page of many panels.
+    Coordinates keep two decimals of a point, which halves a page of many panels; texts, which end
+    in `<`, keep all of theirs.
     """
     file = io.BytesIO()
     figure.savefig(file, format="svg", metadata=_METADATA[".svg"])
-    return re.sub(rb"(\d\.\d\d)\d+", rb"\1", file.getvalue())
+    return re.sub(rb"(\d\.\d\d)\d+(?![\d<])", rb"\1", file.getvalue())

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_FAILED = 0.25  # share of an arm's ended seeds that may fail before there is no verdict
+from sauna.config.controls import rule_of
+from sauna.experiments.statistics import MAX_FAILED
+
+__all__ = ["MAX_FAILED", "Cell", "is_control_among"]
 
 
 class Cell(NamedTuple):
@@ -44,3 +47,8 @@ class Cell(NamedTuple):
     def mean(self, name: str) -> float | None:
         values = self.values(name)
         return float(values.mean()) if len(values) else None
+
+
+def is_control_among(cell: Cell, cells: Sequence[Cell]) -> bool:
+    """Returns whether a cell is the matched control of another one's rule: `gigaflow+random`."""
+    return rule_of(cell.arm) in {other.arm for other in cells}

@@ -5,16 +5,23 @@ from __future__ import annotations
 import os
 import shlex
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import COMPARED_SEEDS, algorithm_of, chosen_preset
+from sauna.config.controls import with_controls
+from sauna.config.presets import (
+    COMPARED,
+    COMPARED_SEEDS,
+    RULE_HELP,
+    algorithm_of,
+    chosen_preset,
+)
 from sauna.config.trust import check_trusted, covers, seal
 from sauna.envs.probe import Probe
-from sauna.experiments.report.numbers import digits_of_tasks, interval, number
+from sauna.experiments.sequential import DESIGN
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
@@ -22,15 +29,16 @@ from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.results import gather, typed
+from sauna.experiments.study.rounds import every_unit, first_look, next_round, round_units, stopped
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
-from sauna.experiments.study.summary import ABLATION, summarize
+from sauna.experiments.study.summary import summarize
+from sauna.experiments.study.text import lines
 from sauna.experiments.study.units import (
     Unit,
     digest_of,
     most_seeds,
     seeds_per_unit,
     study_identity,
-    units_of,
 )
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
@@ -39,8 +47,38 @@ from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import examine, look_at, place
 
 
-def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> Spec:
+def chosen_arms(
+    arms: Sequence[str], rules: Sequence[str], controls: bool, settings: Mapping[str, Any]
+) -> tuple[tuple[str, ...], bool]:
+    """Returns the arms of a comparison, and whether they play a tournament.
+
+    Args:
+      arms: the list that is given, or `all` alone.
+      rules: to be compared with ppo instead.
+      controls: whether each arm that chooses samples gets its matched random control.
+      settings: of every run.
+
+    Raises:
+      BadInput: both are given.
+    """
+    if rules and tuple(arms) != COMPARED:
+        raise BadInput("rules: give --rules or --arms, not both")
+    if tuple(arms) == ("all",):
+        rules = tuple(RULE_HELP)
+    chosen = ("ppo", *rules) if rules else tuple(arms)
+    return with_controls(chosen, settings) if controls else chosen, bool(rules)
+
+
+def comparison(
+    env: str, arms: tuple[str, ...], settings: Mapping[str, Any], sequential: bool = False
+) -> Spec:
     """Returns the study that `sauna compare ENV` runs: its folder is named after its settings.
+
+    Args:
+      env: the task.
+      arms: what is trained; the first is the baseline.
+      settings: of every run.
+      sequential: whether seeds are added only where something is open, `seeds` at most.
 
     Raises:
       BadInput: unknown arms or settings that cannot be used.
@@ -51,7 +89,10 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
     algorithm = algorithm_of(chosen_preset(settings))
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
     entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
-    values = {"tasks": [env], "arms": entries, "seeds": COMPARED_SEEDS, **rules, **settings}
+    seeds, design = COMPARED_SEEDS, {}
+    if sequential:
+        seeds, design = DESIGN[-1].seeds, {"design": "sequential"}
+    values = {"tasks": [env], "arms": entries, "seeds": seeds, **design, **rules, **settings}
     spec = read_spec({"name": "compare", **values})
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in env)
     name = f"compare_{place}_{digest_of(study_identity(spec))}"
@@ -59,11 +100,18 @@ def comparison(env: str, arms: tuple[str, ...], settings: Mapping[str, Any]) -> 
 
 
 def compare_command(
-    env: str, arms: tuple[str, ...], settings: Mapping[str, Any], out: str | Path
+    env: str,
+    arms: Sequence[str],
+    settings: Mapping[str, Any],
+    out: str | Path,
+    rules: Sequence[str] = (),
+    controls: bool = True,
 ) -> str:
     """Returns what a user types to make the same comparison again."""
-    flags = "".join(f" {typed(name, value)}" for name, value in settings.items())
-    return f"sauna compare {shlex.quote(env)} --arms {','.join(arms)}{flags}{_typed_out(out)}"
+    chosen = typed("rules", ",".join(rules)) if rules else typed("arms", ",".join(arms))
+    flags = "" if controls else " --no-controls"
+    flags += "".join(f" {typed(name, value)}" for name, value in settings.items())
+    return f"sauna compare {shlex.quote(env)} {chosen}{flags}{_typed_out(out)}"
 
 
 def study_command(name: str, out: str | Path) -> str:
@@ -173,40 +221,70 @@ def _train(
     size = _unit_size(spec, place, jobs)
     with _locked(folder):
         _note(spec, place, size)
-        units = units_of(spec, size)
+        say = _silent if quiet else partial(print, flush=True)
+        units = every_unit(spec, size)
         check_same_code(units, folder, accept_changed_code)
-        view = StudyView(spec, units, folder, quiet)
-        reopen_damaged(units, folder, view.say)
-        members = sum(len(unit.seeds) for unit in units)
-        view.say(
-            f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {members} members; "
-            f"writing to {place}"
-        )
+        reopen_damaged(units, folder, say)
+        say(_opening(spec, place))
         for note in before_training(spec):
-            view.say(note)
+            say(note)
         noted: list[int] = []
-        with handled(partial(_note_signal, noted)):
+
+        def run(part: Spec, units: list[Unit]) -> None:
+            view = StudyView(part, units, folder, quiet)
             view.open()
             try:
                 executor(folder, jobs, view, lambda: bool(noted)).run(units)
                 view.close()
-                if spec.measure:
-                    measure(
-                        spec,
-                        units,
-                        folder,
-                        place,
-                        min(jobs, cores()),
-                        view.say,
-                        lambda: bool(noted),
-                    )
+                if part.measure:
+                    stopping, few = lambda: bool(noted), min(jobs, cores())
+                    measure(part, units, folder, place, few, view.say, stopping)
             finally:
                 view.close()
+
+        with handled(partial(_note_signal, noted)):
+            if spec.looks:
+                units = _run_looks(spec, size, folder, run, say, noted)
+            else:
+                run(spec, units)
     summary = write(spec, units, folder, place, command)
     if noted:
         name = signal.Signals(noted[0]).name
         raise Interrupted(noted[0], f"stopped by {name}; continue with: {again}")
     return summary
+
+
+def _run_looks(
+    spec: Spec,
+    size: int,
+    folder: Path,
+    run: Callable[[Spec, list[Unit]], None],
+    say: Callable[[str], None],
+    noted: list[int],
+) -> list[Unit]:
+    """Trains look by look until everything is decided, or a signal came; all units until then."""
+    found = next_round(spec, size, folder)
+    while found.waiting is not None and not noted:
+        seeds, arms = spec.looks[found.look].seeds, len(found.waiting.arms)
+        say(f"look {found.look + 1} of {len(spec.looks)}: {arms} arms up to {seeds} seeds")
+        run(found.waiting, round_units(found))
+        before, found = found, next_round(spec, size, folder)
+        for text in stopped(before.replays, found.replays):
+            say(text)
+    return found.units
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+def _opening(spec: Spec, place: Path) -> str:
+    members = sum(len(arm.seeds) * len(arm.tasks) for arm in spec.arms)
+    most = "at most " if spec.looks else ""
+    return (
+        f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {most}{members} members; "
+        f"writing to {place}"
+    )
 
 
 def _note_signal(noted: list[int], number: int) -> None:
@@ -247,7 +325,7 @@ def _unit_size(spec: Spec, place: Path, jobs: int) -> int:
                 f"stay) or give --out"
             )
         return size
-    return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(spec, jobs)
+    return most_seeds(spec) if _on_gpu(spec) else seeds_per_unit(first_look(spec), jobs)
 
 
 def _note(spec: Spec, place: Path, size: int) -> None:
@@ -300,47 +378,6 @@ def write(spec: Spec, units: list[Unit], folder: Path, place: Path, command: str
     run_directory.write_json(place / "summary.json", summary)
     write_report(results, summary, place, section)
     return summary
-
-
-def lines(summary: Mapping[str, Any]) -> list[str]:
-    """Returns the table and the verdicts, as text."""
-    head = [
-        "task",
-        "arm",
-        "seeds",
-        "final return, IQM",
-        "AUC, IQM",
-        "mean +- std",
-        "keep rate",
-        "env steps",
-        "P(improvement)",
-    ]
-    digits = digits_of_tasks(summary["table"])
-    rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    table = ["  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)) for row in rows]
-    said = [v["text"] for v in summary["verdicts"]]
-    if summary["filtering"]:
-        ablation = "Ablation of the selection rule. " + ABLATION
-        said += ["", ablation, *(v["text"] for v in summary["filtering"])]
-    said += summary.get("measured", [])
-    return [*(line.rstrip() for line in table), "", *said]
-
-
-def _row(row: Mapping[str, Any], digits: int) -> list[str]:
-    failed = f" ({row['failed']} failed)" if row["failed"] else ""
-    mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
-    return [
-        row["task"],
-        row["label"],
-        f"{row['seeds']}{failed}",
-        interval(row["final_iqm"], digits),
-        interval(row["auc_iqm"], digits),
-        f"{mean} +- {std}",
-        number(row["keep_rate"], 3),
-        number(row["env_steps"], 0),
-        interval(row["improvement"], 2),
-    ]
 
 
 def cores() -> int:

@@ -22,12 +22,20 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
 # Values of what `sauna compare` takes for trainings, where it is not given.
-UNREAD = {"arms": ",".join(COMPARED), "processes": "0", "on": "local", "address": ""}
+UNREAD: dict[str, Any] = {
+    "arms": ",".join(COMPARED),
+    "processes": "0",
+    "on": "local",
+    "address": "",
+    "rules": "",
+    "controls": True,
+    "accept_changed_code": False,
+}
 LAST = 0.1  # share of the compared env steps whose mean return is the final return
 
 
 def compare_existing(
-    paths: Sequence[Path], tag: str = "", *, out: str = "runs", **others: str
+    paths: Sequence[Path], tag: str = "", *, out: str = "runs", **others: Any
 ) -> list[str]:
     """Compares the arms of runs that exist; the first is the baseline. Nothing is trained.
 

@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sauna.config.controls import rule_of
 from sauna.experiments.report.figures import (
     NOTHING,
     Panel,
     Plot,
     Section,
+    compute_plots,
     looks_of,
     panel_svg,
     plots_of,
@@ -21,6 +23,8 @@ from sauna.experiments.report.page import render
 from sauna.experiments.report.readout import read_out
 from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
+from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
+from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.summary import ABLATION
 from sauna.system.safe_write import replace_file
 
@@ -31,6 +35,7 @@ MARKS = {
     "no evidence": "\N{WHITE CIRCLE}",
     "underpowered": "\N{HORIZONTAL ELLIPSIS}",
     "too many failed": "\N{MULTIPLICATION SIGN}",
+    "open": "\N{HORIZONTAL ELLIPSIS}",
 }
 ANSWERS = {
     "better": "better",
@@ -38,6 +43,7 @@ ANSWERS = {
     "no evidence": "no evidence of a difference",
     "underpowered": "too few seeds to decide",
     "too many failed": "too many seeds failed to decide",
+    "open": "still open",
 }
 UNFOLDED = 5  # verdicts that are shown with all their words
 
@@ -80,6 +86,10 @@ def make_page(
         section=section,
         summary=summary,
         ablation=ABLATION,
+        ranking=tables.ranking(summary),
+        ranking_about=RANKING,
+        equal_compute_about=EQUAL_COMPUTE,
+        by_compute=[(plot, _panels(plot, looks)) for plot in compute_plots(summary)],
         marks=MARKS,
         unfolded=UNFOLDED,
         totals=totals,
@@ -89,7 +99,7 @@ def make_page(
         metric=results["metric"],
         baseline=results["baseline"],
         looks={label: look for label, look in looks.items() if label in drawn},
-        figures=[(plot, [_panel(plot, panel, looks) for panel in plot.panels]) for plot in plots],
+        figures=[(plot, _panels(plot, looks)) for plot in plots],
         paper=tables.paper(results, summary),
         failures=tables.failures(results["cells"]),
         settings=tables.settings(results),
@@ -106,7 +116,9 @@ def question(results: Mapping[str, Any], section: Section = NOTHING) -> str:
         return section.title
     baseline = results["baseline"]
     tasks = list(dict.fromkeys(cell["task"] for cell in results["cells"]))
-    arms = list(dict.fromkeys(cell["label"] for cell in results["cells"]))
+    named = {cell["arm"] for cell in results["cells"]}
+    rules = [cell for cell in results["cells"] if rule_of(cell["arm"]) not in named]
+    arms = list(dict.fromkeys(cell["label"] for cell in rules))
     others = [label for label in arms if label != baseline]
     where = tasks[0] if len(tasks) == 1 else f"{len(tasks)} tasks"
     if not others:
@@ -183,6 +195,10 @@ def pairs(found: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, dict[str, 
         )
         for label, against in dict.fromkeys((v["label"], v["against"]) for v in found)
     ]
+
+
+def _panels(plot: Plot, looks: Mapping[str, Look]) -> list[dict[str, Any]]:
+    return [_panel(plot, panel, looks) for panel in plot.panels]
 
 
 def _panel(plot: Plot, panel: Panel, looks: Mapping[str, Look]) -> dict[str, Any]:

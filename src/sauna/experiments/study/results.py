@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sauna.config.settings import flag, to_json
+from sauna.experiments.compute import cumulated, learner_seconds
 from sauna.experiments.curves import area_under_curve
+from sauna.experiments.study.rounds import tournament_of
 from sauna.experiments.study.spec import Arm, Spec, check
 from sauna.experiments.study.units import Unit, parts
 from sauna.system import run_directory
@@ -47,6 +50,7 @@ def gather(spec: Spec, units: list[Unit], folder: Path, command: str) -> dict[st
         "baseline": spec.baseline,
         "settings": top,
         **_made_with(units, folder),
+        **({"tournament": tournament_of(spec)} if spec.looks else {}),
         "cells": cells,
     }
 
@@ -99,6 +103,7 @@ def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
         rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in part.seeds}
         for row in run_directory.rows(part.run(folder)):
             rows[row["seed"]].append(row)
+        timings = run_directory.rows(part.run(folder), "timing.jsonl")
         for seed in part.seeds:
             error = part.error(folder)
             status = "running" if rows[seed] else "waiting"
@@ -106,13 +111,14 @@ def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
                 status = "complete"
             elif error is not None:
                 status = "failed"
-            found.append(
-                {"seed": seed, "status": status, "error": error, **_ended(rows[seed], budget)}
-            )
+            ended = _ended(rows[seed], budget, timings)
+            found.append({"seed": seed, "status": status, "error": error, **ended})
     return found
 
 
-def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
+def _ended(
+    rows: list[dict[str, Any]], budget: int, timings: Sequence[dict[str, Any]] = ()
+) -> dict[str, Any]:
     """A member's last numbers and its thinned curve.
 
     The AUC is that of the first `budget` env steps, also if kept steps are counted and a member
@@ -123,6 +129,7 @@ def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
     returns = np.array([row.get("return_mean", np.nan) for row in rows], float)
     within = steps <= budget
     kept, tried = last.get("kept_steps"), last.get("env_steps")
+    compute = _compute(rows, timings)
     return {
         "final_return": last.get("return_mean"),
         "auc": area_under_curve(steps[within], returns[within]),
@@ -131,15 +138,38 @@ def _ended(rows: list[dict[str, Any]], budget: int) -> dict[str, Any]:
         "keep_rate": kept / tried if kept is not None and tried else None,
         "episodes": last.get("episodes"),
         "explained_variance": last.get("explained_variance"),
-        "curve": _curve(rows),
+        **{name: _short(values[-1]) for name, values in compute.items()},
+        "curve": _curve(rows, compute),
     }
 
 
-def _curve(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
+def _compute(
+    rows: list[dict[str, Any]], timings: Sequence[dict[str, Any]]
+) -> dict[str, list[float | None]]:
+    """What a member's learning has taken up to each row, for what was recorded."""
+    if not rows:
+        return {}
+    seconds = learner_seconds(timings, rows[0].get("member", ""))
+    found = {
+        "samples_backward": cumulated([row.get("samples_backward") for row in rows]),
+        "learner_cpu_seconds": cumulated([seconds.get(row.get("iteration", -1)) for row in rows]),
+    }
+    return {name: values for name, values in found.items() if values[0] is not None}
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.{DIGITS}g}")
+
+
+def _curve(
+    rows: list[dict[str, Any]], compute: Mapping[str, list[float | None]]
+) -> dict[str, list[Any]]:
     chosen = np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int)).tolist()
     thinned = [rows[i] for i in chosen] if rows else []
     curve: dict[str, list[Any]] = {"env_steps": [row["env_steps"] for row in thinned]}
     moved = ("threshold",) if any("threshold" in row for row in thinned) else ()
     for name in (*CURVES, *moved):
-        curve[name] = [float(f"{row[name]:.{DIGITS}g}") if name in row else None for row in thinned]
+        curve[name] = [_short(row.get(name)) for row in thinned]
+    for name, values in compute.items():
+        curve[name] = [_short(values[i]) for i in chosen]
     return curve

@@ -18,7 +18,8 @@ others are compared with. `question` is the title of the report. `measure` names
 the trained members: `noise` or `coverage` at checkpoints along their training, `posture` (of
 HalfCheetah) at its end, or a `Measurement` of your own as `module:name`. An arm may name its own
 `tasks`, `seeds` and `baseline`. The matched random control of `sauna 0.8` is another arm with its
-settings and `arm = "sauna+random"`.
+settings and `arm = "sauna+random"`. With `design = "sequential"` an arm gets more seeds only while
+it is open, `seeds` at most.
 """
 
 from __future__ import annotations
@@ -48,12 +49,13 @@ from sauna.experiments.measure.measurement import (
     current_name,
     find_measurement,
 )
+from sauna.experiments.sequential import Look, capped
 from sauna.system.errors import BadInput, nearest
 from sauna.system.safe_read import JSON_BYTES, Untrusted, read_file
 
 _OWN = (*fields_with("decided_by_study"), "seeds")
 _NAME = set(string.ascii_letters + string.digits + "-_.+")
-_TOP = ("name", "question", "tasks", "seeds", "baseline", "arms", "measure")
+_TOP = ("name", "question", "tasks", "seeds", "baseline", "arms", "measure", "design")
 FORMER_STUDIES = {"dial": "threshold-sweep"}  # names in 0.1.0
 _ARM = ("label", "arm", "tasks", "seeds", "baseline")
 
@@ -81,6 +83,7 @@ class Spec(NamedTuple):
     arms: list[Arm]
     text: dict[str, Any]
     measure: str | None = None  # names the measurement of the trained members
+    looks: tuple[Look, ...] = ()  # of a sequential design
 
     @property
     def measurement(self) -> Measurement | None:
@@ -127,11 +130,33 @@ def read_spec(values: Mapping[str, Any]) -> Spec:
     measure = values.get("measure")
     if isinstance(measure, str):
         measure = current_name(measure)
-    spec = Spec(name, baseline, arms, _plain(values), measure)
+    spec = Spec(name, baseline, arms, _plain(values), measure, _design(values, arms, baseline))
     configs = [check(arm, task) for arm in arms for task in arm.tasks]
     if measure is not None:
         _check_measure(spec, find_measurement(measure), configs)
     return spec
+
+
+def _design(values: Mapping[str, Any], arms: list[Arm], baseline: str) -> tuple[Look, ...]:
+    """Reads whether seeds come in looks; the looks, none for a fixed number of seeds."""
+    design = values.get("design", "fixed")
+    if design not in ("fixed", "sequential"):
+        raise BadInput(f"study: design must be fixed or sequential, not {design!r}")
+    if design == "fixed":
+        return ()
+    if "measure" in values:
+        raise BadInput("study: measure needs a fixed design")
+    for arm in arms:
+        if arm.seeds != arms[0].seeds or arm.baseline not in (None, baseline):
+            raise BadInput(
+                "study: a sequential design has the same seeds and baseline for all arms"
+            )
+        if arm.arm == "random-drop":
+            raise BadInput("study: random-drop is no arm of a sequential design; use sauna+random")
+    try:
+        return capped(len(arms[0].seeds))
+    except ValueError as error:
+        raise BadInput(f"seeds: {error}; `--arms` with a list trains more") from None
 
 
 def _check_measure(spec: Spec, measurement: Measurement, configs: list[Config]) -> None:

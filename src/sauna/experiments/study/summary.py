@@ -23,7 +23,9 @@ from sauna.experiments.statistics import (
     mean_interval,
     performance_profile,
 )
-from sauna.experiments.study.cells import Cell
+from sauna.experiments.study import ranking
+from sauna.experiments.study.cells import Cell, is_control_among
+from sauna.experiments.study.equal_compute import by_compute, compute_verdicts
 from sauna.experiments.study.verdicts import (
     ABLATION,
     MORE_STEPS,
@@ -63,7 +65,7 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
         for task in dict.fromkeys(cell.task for cell in cells)
     }
     found = {task: _compare(of_task[task]) for task in of_task}
-    return {
+    summary = {
         "verdicts": [
             verdict
             for task, of_label in found.items()
@@ -74,7 +76,24 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
         "over_tasks": _over_tasks(of_task),
         "profiles": {task: _profiles(of_task[task]) for task in of_task},
         "curves": {task: {cell.label: _curves(cell) for cell in of_task[task]} for task in of_task},
+        "equal_compute": [v for own in of_task.values() for v in compute_verdicts(own)],
+        "by_compute": {task: by_compute(own) for task, own in of_task.items()},
     }
+    if "tournament" in results:
+        rows = ranking.rank(results)
+        summary |= {
+            "ranking": rows,
+            "table": _as_ranked(summary["table"], rows),
+            "verdicts": ranking.verdicts(rows),
+            "filtering": ranking.control_verdicts(rows),
+        }
+    return summary
+
+
+def _as_ranked(table: Any, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Replaces each probability of improvement by that of the look where the arm stopped."""
+    ranked = {(row["task"], row["label"]): row["improvement"] for row in rows}
+    return [{**row, "improvement": ranked.get((row["task"], row["label"]))} for row in table]
 
 
 def random_controls(results: Mapping[str, Any], label: str) -> list[str]:
@@ -124,8 +143,11 @@ def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
     found: dict[str, Comparison] = {}
     for baseline in dict.fromkeys(cell.baseline for cell in cells if cell.baseline):
         base = scores.get(baseline, np.zeros(0))
-        family = [cell.label for cell in cells if cell.baseline == baseline]
-        found |= compare({label: (scores[label], base) for label in family})
+        family = [cell for cell in cells if cell.baseline == baseline]
+        # A control answers another question, and takes nothing from the rules' tests.
+        for is_control in (False, True):
+            asked = [c.label for c in family if is_control_among(c, cells) == is_control]
+            found |= compare({label: (scores[label], base) for label in asked})
     return {cell.label: found[cell.label] for cell in cells if cell.baseline}
 
 
@@ -145,6 +167,7 @@ def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
         "keep_rate": cell.mean("keep_rate"),
         "env_steps": cell.mean("env_steps"),
         "kept_steps": cell.mean("kept_steps"),
+        "samples_backward": cell.mean("samples_backward"),
         "improvement": list(comparison.improvement) if comparison else None,
     }
 

@@ -27,6 +27,8 @@ SEED_COLUMNS = {
     "env_steps": "Env steps",
     "kept_steps": "Kept steps",
     "episodes": "Episodes",
+    "samples_backward": "Samples learned from",
+    "learner_cpu_seconds": "Learner CPU seconds",
 }
 FORMER_KEYS = {"auc": "area"}  # in results of 0.1.0
 
@@ -61,6 +63,13 @@ def _whisker(row: Mapping[str, Any], of_task: Sequence[Mapping[str, Any]]) -> li
         return None
     width = max(ends) - min(ends)
     return [f"{4 + 112 * (v - min(ends)) / width:.1f}" for v in row["final_iqm"]]
+
+
+def ranking(summary: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Returns the rows of a tournament's ranking, task by task; none of other studies."""
+    rows = summary.get("ranking", [])
+    tasks = dict.fromkeys(row["task"] for row in rows)
+    return [(task, [row for row in rows if row["task"] == task]) for task in tasks]
 
 
 def paper(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[str, Any] | None:

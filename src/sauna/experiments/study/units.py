@@ -107,7 +107,7 @@ def study_identity(spec: Spec) -> list[Any]:
         [arm.label, arm.baseline, None, identity(arm, task, arm.seeds)]
         for arm in spec.arms
         for task in arm.tasks
-    ] + [spec.measure]
+    ] + [spec.measure, *(["sequential"] if spec.looks else [])]
 
 
 def digest_of(values: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from sauna.config.presets import RANDOM_CONTROL, arm_settings
 from sauna.config.settings import Config
 from sauna.experiments.statistics import ALPHA, POWER, Comparison, compare
-from sauna.experiments.study.cells import MAX_FAILED, Cell
+from sauna.experiments.study.cells import MAX_FAILED, Cell, is_control_among
 from sauna.system.errors import BadInput
 
 # Settings that two arms may differ in and yet differ in the choice of steps alone.
@@ -57,8 +57,13 @@ def verdicts_of(
     for label, comparison in found.items():
         cell = of_label[label]
         absent = Cell(cell.task, str(cell.baseline), "", None, [], 0, 0, 0)
+        if is_control_among(cell, cells):  # compared with its rule
+            continue
         base = of_label.get(str(cell.baseline), absent)
-        family = sum(other.baseline == cell.baseline for other in cells)
+        family = sum(
+            other.baseline == cell.baseline and not is_control_among(other, cells)
+            for other in cells
+        )
         verdicts.append(_verdict(cell, base, comparison, _family(family, "arms"), tasks))
     return verdicts
 
@@ -74,9 +79,12 @@ def ablations_of(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
         f"{cell.label} - {other.label}": (cell, other)
         for cell in cells
         for other in cells
-        if _settings(cell.arm).get("filter") == "sauna"
-        and not _is_controlled(cell)
-        and (is_random_control(other, cell) or _is_head_alone(other, cell))
+        if is_random_control(other, cell)
+        or (
+            _settings(cell.arm).get("filter") == "sauna"
+            and not _is_controlled(cell)
+            and _is_head_alone(other, cell)
+        )
     }
     found = compare(
         {name: (cell.scores(), other.scores()) for name, (cell, other) in pairs.items()}
@@ -124,13 +132,17 @@ def _is_head_alone(other: Cell, cell: Cell) -> bool:
     if other.arm != "vex-head" or cell.baseline is None or other.baseline != cell.baseline:
         return False
     if cell.config and other.config:
-        names = (set(cell.config) | set(other.config)) - set(FILTERS_OWN)
-        return all(cell.config.get(name) == other.config.get(name) for name in names)
+        return _same_rules(other, cell, FILTERS_OWN)
     return all(
         getattr(Config(), name) == value
         for name, value in _settings(cell.arm).items()
         if name not in FILTERS_OWN
     )
+
+
+def _same_rules(other: Cell, cell: Cell, but: Sequence[str] = CONTROLS_OWN) -> bool:
+    names = (set(cell.config) | set(other.config)) - set(but)
+    return all(cell.config.get(name) == other.config.get(name) for name in names)
 
 
 def _verdict(

@@ -1,0 +1,82 @@
+"""The summary of a study as lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sauna.experiments.report.numbers import digits_of_tasks, interval, number
+from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
+from sauna.experiments.study.ranking import ABOUT as RANKING
+from sauna.experiments.study.verdicts import ABLATION
+
+
+def lines(summary: Mapping[str, Any]) -> list[str]:
+    """Returns the table and the verdicts, as text."""
+    head = [
+        "task",
+        "arm",
+        "seeds",
+        "final return, IQM",
+        "AUC, IQM",
+        "mean +- std",
+        "keep rate",
+        "env steps",
+        "P(improvement)",
+    ]
+    digits = digits_of_tasks(summary["table"])
+    rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
+    said = [v["text"] for v in summary["verdicts"]]
+    if "ranking" in summary:
+        said = [*ranking_lines(summary["ranking"]), "", RANKING]
+    if summary["filtering"]:
+        ablation = "Ablation of the selection rule. " + ABLATION
+        said += ["", ablation, *(v["text"] for v in summary["filtering"])]
+    if equal := summary.get("equal_compute"):
+        said += ["", "At equal compute. " + EQUAL_COMPUTE, *(v["text"] for v in equal)]
+    said += summary.get("measured", [])
+    return [*aligned(rows), "", *said]
+
+
+def ranking_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns the ranking of a tournament, as text."""
+    head = ["task", "rank", "arm", "P(improvement)", "seeds", "verdict", "stopped when, why"]
+    texts = [
+        head,
+        *(
+            [
+                row["task"],
+                str(row["rank"]),
+                row["label"],
+                interval(row["improvement"], 2),
+                str(row["seeds"]),
+                row["verdict"],
+                row["reason"],
+            ]
+            for row in rows
+        ),
+    ]
+    return aligned(texts)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Returns rows of texts as lines whose columns stand under each other."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ("  ".join(f"{t:<{w}}" for t, w in zip(row, widths, strict=True)) for row in rows)
+    return [line.rstrip() for line in lines]
+
+
+def _row(row: Mapping[str, Any], digits: int) -> list[str]:
+    failed = f" ({row['failed']} failed)" if row["failed"] else ""
+    mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
+    return [
+        row["task"],
+        row["label"],
+        f"{row['seeds']}{failed}",
+        interval(row["final_iqm"], digits),
+        interval(row["auc_iqm"], digits),
+        f"{mean} +- {std}",
+        number(row["keep_rate"], 3),
+        number(row["env_steps"], 0),
+        interval(row["improvement"], 2),
+    ]
