@@ -34,6 +34,7 @@ FLOORS = (
     "training.worker",
     "training.display",
     "training.tensorboard",
+    "training.empty_updates",
     "training.run",
     "training.coordinator",
     "training.train",

@@ -11,6 +11,7 @@ import pytest
 
 from helpers import SMALL
 from sauna.api import compare
+from sauna.config.presets import COMPARED
 from sauna.experiments.sequential import DESIGN, capped, replay, tournament
 from sauna.experiments.study.command import (
     chosen_arms,
@@ -35,7 +36,7 @@ def spec_of(*rules: str, **settings: Any) -> Spec:
 
 
 QUICK = {key: value for key, value in SMALL.items() if key not in ("seeds", "steps")}
-_DEFAULT = ("ppo", "vex-head", "random-drop", "sauna")
+_DEFAULT = COMPARED
 
 
 def returns(label: str, seed: int) -> float:
