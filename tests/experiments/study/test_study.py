@@ -367,7 +367,7 @@ def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
     lines = [f"{k} = {json.dumps(v)}" for k, v in text.items() if k != "arms"]
     lines += [f"[[arms]]\nlabel = {json.dumps(arm['label'])}" for arm in arms]
     (tmp_path / "unlucky.toml").write_text("\n".join(lines))
-    done = sauna("study", "unlucky.toml", "--out", "out", "--processes=2", cwd=tmp_path)
+    done = sauna("study", "unlucky.toml", "--trust", "--out=out", "--processes=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "FAILED: worlds:Unlucky, sauna, seed 1" in done.stdout
     results = json.loads((tmp_path / "out" / "unlucky" / "results.json").read_text())
@@ -380,7 +380,7 @@ def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
     assert [(row["seeds"], row["failed"]) for row in table] == [(2, 1), (2, 1)]
     page = (tmp_path / "out" / "unlucky" / "report.html").read_text()
     assert "out of luck" in page
-    again = sauna("study", "unlucky.toml", "--out", "out", "--processes=2", cwd=tmp_path)
+    again = sauna("study", "unlucky.toml", "--trust", "--out=out", "--processes=2", cwd=tmp_path)
     assert again.returncode == 0 and "FAILED" not in again.stdout
 
 
