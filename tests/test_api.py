@@ -54,6 +54,8 @@ def test_rows_hold_every_metric(result) -> None:
         "episodes",
         "episode_returns",
         "episode_lengths",
+        "episode_return_mean",
+        "episode_length_mean",
         "episode_truncated",
         "return_mean",
         "policy_loss",

@@ -167,7 +167,7 @@ def test_feet_touch_the_ground_that_they_stand_on() -> None:
 
 
 PICTURE = f"""
-from sauna.experiments.evaluate.episodes import choose_renderer
+from sauna.experiments.evaluate.video import choose_renderer
 choose_renderer()
 from sauna.envs.make import make_env
 env = make_env({ID!r}, {{}}, render_mode="rgb_array")

@@ -142,7 +142,7 @@ def test_eval_names_the_damage_and_uses_what_fits(run: Path) -> None:
 
 
 def test_a_study_continues_a_complete_run_whose_rows_are_damaged(run: Path, tmp_path) -> None:
-    unit = Unit("unit", "worlds:Scripted", "ppo", (0,), {}, None)
+    unit = Unit("unit", "worlds:Scripted", "ppo", (0,), {})
     said: list[str] = []
     reopen_damaged([unit], tmp_path, said.append)
     assert said == [] and unit.is_complete(tmp_path)
