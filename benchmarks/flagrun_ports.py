@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.make import make_env
-from sauna.experiments.evaluate.episodes import choose_renderer
+from sauna.experiments.evaluate.video import choose_renderer
 from sauna.system import run_directory
 
 ROOT = Path(__file__).parent.parent
