@@ -169,7 +169,7 @@ class OnDevice:
         plain = make_job("worlds:Scripted", arm="ppo", envs=ENVS, steps=steps)
         spaces = plain.spaces._replace(action_sizes=(1,))
         config, self._member = plain.config, plain.members[0]
-        self._setting = _setting(self._member, [0.0], 1)
+        self._setting = _setting(self._member)
 
         def begin(poison: Poison) -> tuple[Parts, MemberState]:
             parts = make_iteration(config, spaces, flat(poisoned(poison)), lambda here: here)
