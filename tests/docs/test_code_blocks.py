@@ -25,7 +25,7 @@ from sauna import cli
 from sauna.config.presets import PRESETS, parse_all, resolve
 from sauna.config.settings import FIELDS
 from sauna.envs.make import make_env
-from sauna.experiments.study.command import comparison
+from sauna.experiments.study.command import chosen_arms, comparison
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -138,7 +138,10 @@ def check_sauna(arguments: list[str]) -> None:
         settings = {k: v for k, v in settings.items() if k not in ("env", "out", "processes")}
         if len(parsed.env) > 1:  # runs that exist
             return
-        comparison(parsed.env[0], tuple(parsed.arms.split(",")), parse_all(settings))
+        rules = tuple(filter(None, parsed.rules.split(",")))
+        arms = tuple(parsed.arms.split(","))
+        chosen, is_tournament = chosen_arms(arms, rules, parsed.controls, parse_all(settings))
+        comparison(parsed.env[0], chosen, parse_all(settings), is_tournament)
         return
     resolve(settings)
     if ":" in settings["env"]:
