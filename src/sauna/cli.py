@@ -366,9 +366,7 @@ def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: An
         raise SaunaError("no training ended well; the report and the units' stderr.txt say why")
     if number := summary.get("not_measured"):
         log = spec.measurement.folder(Path(out) / spec.name) / "stderr.txt"
-        raise SaunaError(
-            f"{number} members are not measured; what is said above, and {log}, say why"
-        )
+        raise SaunaError(f"{number} members are not measured; the lines above and {log} say why")
 
 
 def _bench(values: dict[str, Any]) -> None:

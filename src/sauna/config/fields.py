@@ -1,6 +1,6 @@
 """What a setting is: its default, its help line, the values it accepts, and who may change it.
 
-Everything that is said of a setting stands at the setting, in `Config`. To add one, add a line
+Everything about a setting stands at the setting, in `Config`. To add one, add a line
 there: the command line, `config.json`, the checks, resuming and studies read its marks.
 """
 

@@ -57,7 +57,7 @@ def learner_seconds(timings: Sequence[dict[str, Any]], member: str) -> dict[int,
     """Returns a member's CPU seconds of the learner in each iteration, where they are known.
 
     The program is compiled in a run's first iteration, which counts as the second one. Compiling
-    again when a run is resumed is not told apart, and counts.
+    again when a run is resumed cannot be separated, and counts.
 
     Args:
       timings: the rows of `timing.jsonl`.

@@ -21,7 +21,7 @@ from sauna.config.settings import Config
 from sauna.system.errors import BadInput
 
 CLIP_BELOW = -5.0  # of the per-sample target, whose lower tail is unbounded
-# Variance over mean square below which equal float32 returns are told apart by rounding only.
+# Variance over mean square below which equal float32 returns differ by rounding only.
 ROUNDING = 1e-8
 
 

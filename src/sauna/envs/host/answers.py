@@ -67,7 +67,7 @@ def _is_of_seed(error: Exception, seed: int) -> bool:
 
 
 def close(env: Any, name: str = "the environment") -> None:
-    """Closes an environment; that it cannot be closed is said once, and costs nothing else."""
+    """Closes an environment; a failure to close prints one line, once, and costs nothing else."""
     try:
         env.close()
     except (Exception, SystemExit) as error:
