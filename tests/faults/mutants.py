@@ -220,25 +220,31 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "algorithm/learner/update.py",
-        "ppo samples faults/test_07_poisoned_batch",
-        (
-            "uphill",
-            "state.params - hypers.learning_rate * step",
-            "state.params + hypers.learning_rate * step",
-        ),
+        "algorithm/learner/optimizers.py",
+        "ppo samples optimizers faults/test_07_poisoned_batch",
         (
             "element-wise clipping",
             "optax.clip_by_global_norm(hypers.max_grad_norm)",
             "optax.clip(hypers.max_grad_norm)",
         ),
         ("no clipping", "optax.clip_by_global_norm(hypers.max_grad_norm)", "optax.identity()"),
+        ("other epsilon of Adam", '"eps": config.adam_epsilon', '"eps": 1e-2'),
+        ("the KL raises the rate", "kl > 2.0 * config.desired_kl", "kl < 2.0 * config.desired_kl"),
+        ("the rate has no floor", "rate / FACTOR, config.learning_rate_min", "rate / FACTOR, 0.0"),
+    ),
+    *_of(
+        "algorithm/learner/update.py",
+        "ppo samples faults/test_07_poisoned_batch",
+        (
+            "uphill",
+            "state.params - rate * step",
+            "state.params + rate * step",
+        ),
         (
             "Adam forgets",
-            "return TrainState(params, scale, state.sampler)",
-            "return TrainState(params, state.optimizer, state.sampler)",
+            "return TrainState(params, scale, state.sampler",
+            "return TrainState(params, state.optimizer, state.sampler",
         ),
-        ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
         ("minibatches repeat", "default_rng([seed, iteration])", "default_rng([seed])"),
         ("one order for all members", "default_rng([seed, iteration])", "default_rng([iteration])"),
         (

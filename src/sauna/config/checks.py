@@ -99,9 +99,28 @@ def check_consistent(config: Config) -> None:
         )
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
+    check_rate(config)
     check_rules(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
+
+
+def check_rate(config: Config) -> None:
+    """Refuses a learning rate that its schedule cannot move.
+
+    Raises:
+      BadInput: with the one line that says why.
+    """
+    if config.learning_rate_schedule != "kl":
+        return
+    if config.algorithm != "ppo":
+        raise BadInput("learning_rate_schedule: kl needs algorithm ppo, which measures the KL")
+    least, most = config.learning_rate_min, config.learning_rate_max
+    if not least <= config.learning_rate <= most:
+        raise BadInput(
+            f"learning_rate: {config.learning_rate} lies outside learning_rate_min {least} and "
+            f"learning_rate_max {most}"
+        )
 
 
 def check_rules(config: Config) -> None:

@@ -27,6 +27,8 @@ SAMPLERS = (
 )
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
 NETWORKS = ("auto", "mlp", "nature-cnn")
+OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
+SCHEDULES = ("constant", "linear", "cosine")
 
 _task = partial(option, group="task")
 _run = partial(option, group="run", shapes_program=False)
@@ -163,9 +165,45 @@ class Config:
         3e-4, "the optimizer's step size", above=0, common=True, shapes_program=False
     )
     learning_rate_schedule: str = _learning(
-        "linear", "over the budget of steps: to 0, or constant", choices=("linear", "constant")
+        "linear",
+        "over the budget of steps: to 0 (linear, cosine), constant, a factor of your own, or moved "
+        "to hold a KL divergence (kl)",
+        choices=("linear", "constant", "cosine", "kl"),
+        plugin=True,
     )
-    optimizer: str = _learning("adam", "what scales the gradient", choices=("adam", "rmsprop"))
+    warmup: float = _learning(
+        0.0,
+        "share of the budget over which the learning rate rises first",
+        at_least=0,
+        at_most=0.99,
+        read_when=readers.NO_KL_RATE,
+    )
+    desired_kl: float = _learning(
+        0.01,
+        "the KL divergence that schedule kl holds: above twice of it the rate is divided by 1.5, "
+        "below half of it multiplied",
+        above=0,
+        read_when=readers.KL_RATE,
+    )
+    learning_rate_min: float = _learning(
+        1e-5, "the least rate of schedule kl", above=0, read_when=readers.KL_RATE
+    )
+    learning_rate_max: float = _learning(
+        1e-2, "the largest rate of schedule kl", above=0, read_when=readers.KL_RATE
+    )
+    optimizer: str = _learning(
+        "adam",
+        "what makes a step of the gradient: an optimizer here or of optax (optax:adan)",
+        choices=OPTIMIZERS,
+        plugin=True,
+    )
+    optimizer_kwargs: str = _learning("{}", "arguments of the optimizer, as a JSON object")
+    weight_decay: float = _learning(
+        0.0,
+        "share of each parameter taken off in a step, times the learning rate (0: what the "
+        "optimizer does by itself)",
+        at_least=0,
+    )
     adam_epsilon: float = _learning(1e-5, "Adam's epsilon", above=0, read_when=readers.ADAM)
     rmsprop_epsilon: float = _learning(
         1e-5, "RMSProp's epsilon, under the root", above=0, read_when=readers.RMSPROP
@@ -187,12 +225,26 @@ class Config:
         shapes_program=False,
         read_when=readers.PPO,
     )
+    clip_range_schedule: str = _learning(
+        "constant",
+        "over the budget of steps: constant, to 0 (linear, cosine), or a factor of your own",
+        choices=SCHEDULES,
+        plugin=True,
+        read_when=readers.PPO,
+    )
     clip_value: bool = _learning(
         True, "clip the value function's change as the ratio's", read_when=readers.PPO
     )
     normalize_advantages: bool = _learning(True, "standardise the advantages of each minibatch")
     entropy_coef: float = _learning(
         0.0, "weight of the entropy bonus", at_least=0, shapes_program=False
+    )
+    entropy_coef_schedule: str = _learning(
+        "constant",
+        "as the clip range's",
+        choices=SCHEDULES,
+        plugin=True,
+        read_when=readers.ENTROPY,
     )
     value_coef: float = _learning(0.5, "weight of the value loss", at_least=0, shapes_program=False)
     gamma: float = _learning(0.99, "discount", at_least=0, at_most=1, shapes_program=False)

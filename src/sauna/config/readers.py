@@ -10,6 +10,12 @@ WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
 PPO = ("algorithm ppo", lambda c: c.algorithm == "ppo")
 ADAM = ("optimizer adam", lambda c: c.optimizer == "adam")
 RMSPROP = ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")
+KL_RATE = ("learning_rate_schedule kl", lambda c: c.learning_rate_schedule == "kl")
+NO_KL_RATE = (
+    "a learning_rate_schedule other than kl",
+    lambda c: c.learning_rate_schedule != "kl",
+)
+ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
 VECTORS = (

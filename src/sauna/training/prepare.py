@@ -177,7 +177,12 @@ def check_own_parts(prepared: Prepared) -> None:
       BadInput: a part cannot be used.
     """
     config = prepared.config
-    numbers = (config.sampler_kwargs, config.loss_weight_kwargs, config.stop_kwargs)
+    numbers = (
+        config.sampler_kwargs,
+        config.loss_weight_kwargs,
+        config.stop_kwargs,
+        config.optimizer_kwargs,
+    )
     rules = any(text != "{}" for text in numbers) or config.control == "stride"
     if own_parts(config) or rules:
         configure_jax()

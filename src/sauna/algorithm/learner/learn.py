@@ -14,6 +14,7 @@ from sauna.algorithm.learner.metrics import (
     head_statistics,
     variance_explained,
 )
+from sauna.algorithm.learner.optimizers import moves_rate
 from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
 from sauna.algorithm.learner.update import Parts, loss_advantage, update_on_all, vex_targets
 from sauna.algorithm.selection.vex_filter import moved_threshold
@@ -65,6 +66,7 @@ def learn(
         mean_target,
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
+        state.learning_rate if moves_rate(config) else jnp.float32(jnp.nan),
         sound & jnp.all(jnp.isfinite(state.params)),
         work,
     )

@@ -39,6 +39,7 @@ class UpdateMetrics(NamedTuple):
     vex_spread: Array  # their standard deviation
     vex_median: Array
     threshold: Array  # where it moves: that of this iteration; else NaN
+    learning_rate: Array  # if the KL divergence moves it: that of the last step; else NaN
     finite: Array  # bool: parameters and losses are finite
     work: Work
 

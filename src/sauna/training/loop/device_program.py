@@ -56,7 +56,7 @@ class Report(NamedTuple):
     ends: Ends
     faults: Faults
     learned: UpdateMetrics
-    learning_rate: Array
+    hypers: Hypers  # after their schedules
 
 
 class IterationParts(NamedTuple):
@@ -117,7 +117,7 @@ def iterate(
         learner, collected, state.env_steps + env_steps, state.kept_steps + kept_steps
     )
     after = jax.tree.map(lambda new, old: jnp.where(has_budget, new, old), after, state)
-    report = Report(has_budget, env_steps, kept_steps, ends, faults, learned, hypers.learning_rate)
+    report = Report(has_budget, env_steps, kept_steps, ends, faults, learned, hypers)
     return after, report
 
 
