@@ -253,9 +253,10 @@ def _train(values: dict[str, Any]) -> None:
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
-    """Puts what is typed over what a file says; `--seed` and `--batch-size` count as typed."""
-    replaced = {"seed": "seeds", "batch_size": "minibatches"}
+    """Puts what is typed over what a file says; what stands for a field counts as typed."""
+    replaced = {"seed": "seeds", "batch_size": "minibatches", "target_kl": "stop"}
     gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
+    gone += ["stop_kwargs"] * ("stop" in gone)
     return translate({k: v for k, v in stored.items() if k not in gone} | typed)
 
 
