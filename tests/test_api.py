@@ -25,6 +25,31 @@ from worlds import Finite, Scripted
 ROOT = Path(__file__).parent.parent
 
 
+class Listed(sauna.Tracker):
+    """A tracker of the user's own, which keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple] = []
+
+    def open(self, run: sauna.TrackedRun) -> dict:
+        return {"urls": dict.fromkeys(run.members, "https://here")}
+
+    def row(self, row) -> None:
+        self.calls.append(("row", row["member"], row["env_steps"]))
+
+    def picture(self, name: str, path: Path) -> None:
+        self.calls.append(("picture", name, path))
+
+    def summary(self, members, complete: bool) -> None:
+        self.calls.append(("summary", members, complete))
+
+    def close(self) -> None:
+        self.calls.append(("close",))
+
+
+LISTED = Listed()
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     run = tmp_path_factory.mktemp("api") / "run"
@@ -32,7 +57,7 @@ def result(tmp_path_factory):
         "worlds:Scripted",
         quiet=True,
         out=run,
-        tensorboard=True,
+        track=["tensorboard", LISTED],
         **{**SMALL, "arm": "sauna", "seeds": 2},
     )
 
@@ -145,6 +170,19 @@ def test_tensorboard_holds_the_same_numbers(result) -> None:
     rows = [row for row in result.metrics if row["member"] == "sauna/0"]
     for name in ("keep_rate", "vex_mean", "entropy", "kept_steps", "learning_rate"):
         np.testing.assert_allclose(found[name], [row[name] for row in rows], rtol=1e-6)
+
+
+def test_a_tracker_of_one_s_own_gets_all_and_the_summary_says_where(result) -> None:
+    rows = [call[1:] for call in LISTED.calls if call[0] == "row"]
+    assert rows == [(row["member"], row["env_steps"]) for row in result.metrics]
+    others = [call for call in LISTED.calls if call[0] != "row"]
+    assert others == [
+        ("summary", result.summary, True),
+        ("picture", "learning_curve", result.path / "figures" / "learning_curve.png"),
+        ("close",),
+    ]
+    (urls,) = run_directory.read_config_file(result.path / "summary.json")["tracking"].values()
+    assert urls == {"sauna/0": "https://here", "sauna/1": "https://here"}
 
 
 def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:

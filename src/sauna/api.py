@@ -14,7 +14,7 @@ from sauna.config.settings import fields_with
 from sauna.envs.make import check_makes, known_in_this_process_alone
 from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
-from sauna.system.errors import BadInput, Interrupted
+from sauna.system.errors import BadInput
 from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
@@ -97,12 +97,7 @@ def train_and_draw(run: runs.Run, display: Display, *, resume: bool, inexact: bo
     Raises:
       BadInput, Interrupted, SaunaError: as `train_run`.
     """
-    try:
-        if train_run(run, display, resume=resume, inexact=inexact):
-            draw_curve(run.path)
-    except Interrupted:
-        draw_curve(run.path)
-        raise
+    train_run(run, display, resume=resume, inexact=inexact, draw=draw_curve)
 
 
 def compare(
@@ -176,7 +171,8 @@ def resume(
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    rest = provide(Path(path), changes, PARTS)
+    named = {n: _named(n, v) if n == "track" else v for n, v in changes.items()}
+    rest = provide(Path(path), named, PARTS)
     run = runs.reopen(Path(path), rest, display, trust, accept_changed_code)
     train_and_draw(run, display, resume=True, inexact=inexact)
     return Result(run.path)
@@ -211,4 +207,6 @@ def load(
 
 def _named(name: str, value: Any) -> Any:
     """Names a part that was passed by value; other values stay."""
+    if name == "track" and value is not None and not isinstance(value, str):
+        return [name_of(one) for one in (value if isinstance(value, list | tuple) else [value])]
     return name_of(value) if name in PARTS and value is not None else value

@@ -11,24 +11,15 @@ from dataclasses import dataclass
 from functools import partial
 
 from sauna.config import readers
-from sauna.config.fields import option
-
-FILTERS = ("none", "sauna", "random-drop")
-SAMPLERS = (
-    "none",
-    "gigaflow",
-    "top-advantage",
-    "prioritized",
-    "gradient-norm",
-    "kondo",
-    "positive",
-    "pods",
-    "vex-oracle",
+from sauna.config.choices import (
+    FILTERS,
+    NETWORKS,
+    OPTIMIZERS,
+    SAMPLERS,
+    SCHEDULES,
+    VEX_TARGETS,
 )
-VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
-NETWORKS = ("auto", "mlp", "nature-cnn")
-OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
-SCHEDULES = ("constant", "linear", "cosine")
+from sauna.config.fields import option
 
 _task = partial(option, group="task")
 _run = partial(option, group="run", shapes_program=False)
@@ -147,9 +138,17 @@ class Config:
         resumable=True,
         machine_local=True,
     )
-    tensorboard: bool = _run(
-        False,
-        "also write the metrics for TensorBoard",
+    track: tuple[str, ...] = _run(
+        ("none",),
+        "where else the metrics go: tensorboard, wandb, trackio, mlflow, module:Class, or several",
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+    track_project: str = _run(
+        "sauna",
+        "the trackers' project or experiment",
+        read_when=readers.TRACKED,
         resumable=True,
         machine_local=True,
         decided_by_study=True,

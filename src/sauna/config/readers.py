@@ -7,6 +7,7 @@ from __future__ import annotations
 
 ON_HOST = ("environments on the host", lambda c: c.backend != "device")
 WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
+TRACKED = ("track", lambda c: c.track != ("none",))
 PPO = ("algorithm ppo", lambda c: c.algorithm == "ppo")
 ADAM = ("optimizer adam", lambda c: c.optimizer == "adam")
 RMSPROP = ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")

@@ -9,7 +9,7 @@ are shared over processes.
 from __future__ import annotations
 
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -30,7 +30,7 @@ from sauna.system.watchdog import Watchdog
 from sauna.training.display import Display
 from sauna.training.empty_updates import EmptyUpdates
 from sauna.training.run import Run, resume_command
-from sauna.training.tensorboard import TensorBoard
+from sauna.training.tracking.trackers import Trackers
 from sauna.training.worker import serve, write_job
 
 LEAD = 2  # iterations that a process may be ahead of the slowest one
@@ -39,7 +39,12 @@ MAX_LEAD = 64
 
 
 class Coordinator:
-    """The workers of one run and what they have sent but is not yet written."""
+    """The workers of one run and what they have sent but is not yet written.
+
+    Args:
+      tracked: for each member the env steps up to which its rows were tracked before.
+      draw: draws a figure of the run at its end; None if there is nothing to draw.
+    """
 
     def __init__(
         self,
@@ -47,8 +52,10 @@ class Coordinator:
         display: Display,
         loaded: checkpoint.Checkpoint | None,
         inexact: bool,
+        tracked: Mapping[str, int],
+        draw: Callable[[Path], Path | None] | None,
     ) -> None:
-        self._run, self._display = run, display
+        self._run, self._display, self._draw = run, display, draw
         self._iteration = loaded.manifest["iteration"] if loaded else 0
         self._parts = np.array_split(np.arange(len(run.members)), run.config.processes)
         self._rows: dict[int, dict[int, Message]] = {}
@@ -60,13 +67,14 @@ class Coordinator:
         self._lead, self._granted = LEAD, 0
         self._signal: int | None = None
         self._stopping = False
-        self._tensorboard = TensorBoard(run.path, run.config)
         self._empty_updates = EmptyUpdates()
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
         self._workers = [self._start(part, loaded, replay) for part in self._parts]
         self._watchdog = Watchdog(self._workers)
+        own = (run.path, run.config, run.members, display.say)
+        self._trackers = Trackers(*own, tracked if replay else {})
 
     def _start(
         self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
@@ -102,7 +110,7 @@ class Coordinator:
         self._watchdog.close()
         for worker in self._workers:
             worker.stop(0.0 if error[0] else 5.0)
-        self._tensorboard.close()
+        self._trackers.close()
         self._display.close()
 
     def run(self) -> None:
@@ -121,6 +129,8 @@ class Coordinator:
             complete = self._signal is None
             self._save(self._last_iteration(), self._logs.counted())
             self._write_summary(complete)
+        if self._draw is not None and (figure := self._draw(run.path)) is not None:
+            self._trackers.picture(figure.stem, figure)
         if not complete:
             raise Interrupted(
                 self._signal or 0,
@@ -278,7 +288,7 @@ class Coordinator:
             self._display.say(warning)
         self._logs.append("metrics.jsonl", rows)
         self._logs.append("timing.jsonl", [timing])
-        self._tensorboard.write(rows, timing)
+        self._trackers.rows(rows, timing["steps_per_second"])
 
     def _write_summary(self, complete: bool) -> None:
         check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
@@ -299,10 +309,11 @@ class Coordinator:
             name: {key: row[key] for key in kept if key in row} for name, row in last.items()
         }
         text = "return_mean: mean training return (sampled actions) of the last 100 episodes"
-        run_directory.write_json(
-            self._run.path / "summary.json",
-            {"complete": complete, "metric": text, "members": summary},
-        )
+        whole: dict[str, Any] = {"complete": complete, "metric": text, "members": summary}
+        if self._trackers.urls:
+            whole["tracking"] = self._trackers.urls
+        run_directory.write_json(self._run.path / "summary.json", whole)
+        self._trackers.summary(summary, complete)
         self._display.summary(summary)
 
 

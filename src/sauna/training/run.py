@@ -33,7 +33,7 @@ from sauna.training.prepare import (
     examine,
     place,
 )
-from sauna.training.tensorboard import TensorBoard
+from sauna.training.tracking.trackers import check_trackers
 
 
 class Run:
@@ -92,7 +92,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         placed = place(resolve_run(overrides))
         check_writes(placed.config)
         prepared = examine(placed, overrides)
-        TensorBoard.check(prepared.config)
+        check_trackers(prepared.config)
         check_own_parts(prepared)
     path, made = _make_directory(prepared.config)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
@@ -207,7 +207,7 @@ def reopen(
     _check_source(path, stored)
     changed = before.replace(**parse_all(changes))
     check_consistent(changed.config)
-    TensorBoard.check(changed.config)
+    check_trackers(changed.config)
     changed = place(changed)
     check_writes(changed.config)
     if (changed.config.backend == "device") != (before.config.backend == "device"):

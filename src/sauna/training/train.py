@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,21 @@ from sauna.system.logs import check_logs, cut_logs, damage_of
 from sauna.training.coordinator import Coordinator
 from sauna.training.display import Display
 from sauna.training.run import Run, disk_errors
+from sauna.training.tracking.trackers import chosen, last_steps
 
 
-def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> bool:
+def train_run(
+    run: Run,
+    display: Display,
+    *,
+    resume: bool,
+    inexact: bool = False,
+    draw: Callable[[Path], Path | None] | None = None,
+) -> bool:
     """Trains a run to its end; returns when everything is written.
+
+    Args:
+      draw: draws a figure of the run at its end, for its trackers, too.
 
     Returns:
       False if it was complete already, so that nothing was done.
@@ -32,7 +44,7 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
         if inexact and run.config.backend == "device":
             raise BadInput("inexact: a run on the device brings its environments back exactly")
         with disk_errors(run.path):
-            return _train(run, display, resume, inexact)
+            return _train(run, display, resume, inexact, draw)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
             run_directory.discard(run.path, run.made)
@@ -41,15 +53,22 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
         run.lock.close()
 
 
-def _train(run: Run, display: Display, resume: bool, inexact: bool) -> bool:
-    loaded = None
+def _train(
+    run: Run,
+    display: Display,
+    resume: bool,
+    inexact: bool,
+    draw: Callable[[Path], Path | None] | None,
+) -> bool:
+    loaded, tracked = None, {}
     if resume:
         if run_directory.is_complete(run.path) and _is_whole(run, display):
             display.say(f"{run.path} is complete; nothing to do")
             return False
         loaded = _load(run, display)
+        tracked = last_steps(run_directory.rows(run.path)) if chosen(run.config) else {}
         cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
-    with Coordinator(run, display, loaded, inexact) as coordinator:
+    with Coordinator(run, display, loaded, inexact, tracked, draw) as coordinator:
         coordinator.run()
     return True
 

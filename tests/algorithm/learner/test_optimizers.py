@@ -16,7 +16,7 @@ from helpers import configured
 from sauna.algorithm.learner.optimizers import moved_rate, scaling
 from sauna.algorithm.learner.update import Parts, gradient_step, init_state, plain_minibatch
 from sauna.algorithm.policy.policy import make_policy
-from sauna.config.options import OPTIMIZERS
+from sauna.config.choices import OPTIMIZERS
 from sauna.config.settings import Config
 from sauna.system.errors import BadInput
 from sauna.training.check_plugins import check_optimizer
