@@ -10,15 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from sauna.config import readers
-from sauna.config.choices import (
-    FILTERS,
-    NETWORKS,
-    OPTIMIZERS,
-    SAMPLERS,
-    SCHEDULES,
-    VEX_TARGETS,
-)
+from sauna.config import choices, readers
 from sauna.config.fields import option
 
 _task = partial(option, group="task")
@@ -193,7 +185,7 @@ class Config:
     optimizer: str = _learning(
         "adam",
         "what makes a step of the gradient: an optimizer here or of optax (optax:adan)",
-        choices=OPTIMIZERS,
+        choices=choices.OPTIMIZERS,
         plugin=True,
     )
     optimizer_kwargs: str = _learning("{}", "arguments of the optimizer, as a JSON object")
@@ -227,7 +219,7 @@ class Config:
     clip_range_schedule: str = _learning(
         "constant",
         "over the budget of steps: constant, to 0 (linear, cosine), or a factor of your own",
-        choices=SCHEDULES,
+        choices=choices.SCHEDULES,
         plugin=True,
         read_when=readers.PPO,
     )
@@ -241,7 +233,7 @@ class Config:
     entropy_coef_schedule: str = _learning(
         "constant",
         "as the clip range's",
-        choices=SCHEDULES,
+        choices=choices.SCHEDULES,
         plugin=True,
         read_when=readers.ENTROPY,
     )
@@ -254,7 +246,7 @@ class Config:
     network: str = _network(
         "auto",
         "trunk (auto: nature-cnn for images of 36 x 36 pixels or more, else mlp)",
-        choices=NETWORKS,
+        choices=choices.NETWORKS,
         plugin=True,
     )
     hidden: tuple[int, ...] = _network(
@@ -296,21 +288,21 @@ class Config:
     vex_target: str = _rule(
         "sample",
         "what the Vex head regresses",
-        choices=VEX_TARGETS,
+        choices=choices.VEX_TARGETS,
         plugin=True,
         read_when=readers.VEX,
     )
     vex_coef: float = _selection(
         0.5, "weight of the Vex loss (c2 of eq. 6)", at_least=0, shapes_program=False
     )
-    filter: str = _rule("sauna", "which transitions the update keeps", choices=FILTERS, plugin=True)
+    filter: str = _rule("sauna", "which transitions are kept", choices=choices.FILTERS, plugin=True)
     filter_kwargs: str = _rule(
         "{}", "arguments of your own filter, as a JSON object", read_when=readers.OWN_FILTER
     )
     sampler: str = _selection(
         "none",
         "which of the rollout's samples the update learns from, once advantages are known",
-        choices=SAMPLERS,
+        choices=choices.SAMPLERS,
         plugin=True,
     )
     sampler_kwargs: str = _selection(
