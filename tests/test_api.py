@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import sauna
-from helpers import SMALL, own
+from helpers import SMALL, environment, own
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.report.curve import interval, member_curves
@@ -183,6 +183,55 @@ def test_a_tracker_of_one_s_own_gets_all_and_the_summary_says_where(result) -> N
     ]
     (urls,) = run_directory.read_config_file(result.path / "summary.json")["tracking"].values()
     assert urls == {"sauna/0": "https://here", "sauna/1": "https://here"}
+
+
+def test_a_result_is_a_figure_and_a_table(result, monkeypatch) -> None:
+    figure = result.plot()
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    lines = [line.get_ydata() for line in figure.axes[0].lines]
+    means = [row["return_mean"] for row in result.metrics if row["member"] == "sauna/1"]
+    assert any(np.array_equal(line, means) for line in lines)
+    monkeypatch.setitem(sys.modules, "pandas", None)  # as if it were not installed
+    assert result.table("metrics") == result.metrics
+    expected = [{"member": name, **numbers} for name, numbers in result.summary.items()]
+    assert result.table() == expected
+    with pytest.raises(BadInput, match="'members' or 'metrics'"):
+        result.table("rows")
+
+
+def test_a_table_is_a_data_frame_if_pandas_is_there(result) -> None:
+    pandas = pytest.importorskip("pandas")
+    table = result.table()
+    assert isinstance(table, pandas.DataFrame)
+    assert table.to_dict("records") == [{"member": n, **x} for n, x in result.summary.items()]
+
+
+SCRIPT = """
+import sauna
+
+with open("times.txt", "a") as file:
+    file.write("run\\n")
+result = sauna.train("worlds:Scripted", quiet=True, out="run", arm="ppo", processes=2, {settings})
+print(len(result.metrics), result.table().shape if hasattr(result.table(), "shape") else "")
+"""
+
+
+@pytest.mark.slow
+def test_a_script_needs_no_main_guard(tmp_path) -> None:
+    """Two training processes, each with a process of environments; the script runs once."""
+    settings = {**SMALL, "seeds": 2, "env_processes": 1}
+    text = ", ".join(f"{name}={value!r}" for name, value in settings.items())
+    (tmp_path / "script.py").write_text(SCRIPT.format(settings=text))
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("8 ")
+    assert (tmp_path / "times.txt").read_text() == "run\n"
 
 
 def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:

@@ -12,9 +12,9 @@ from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
 from sauna.config.settings import fields_with
 from sauna.envs.make import check_makes, known_in_this_process_alone
-from sauna.experiments.report.curve import draw_curve
+from sauna.experiments.report.curve import curve_figure, draw_curve
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.train import train_run
@@ -40,10 +40,14 @@ def _env_name(env: Any) -> str:
 
 
 class Result:
-    """A finished run: its directory, its numbers, its policies."""
+    """A finished run: its directory, its numbers, its figure, its policies.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Args:
+      path: the run directory.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
 
     @property
     def metrics(self) -> list[dict[str, Any]]:
@@ -54,6 +58,37 @@ class Result:
     def summary(self) -> dict[str, Any]:
         """`member name -> final numbers`, as in `summary.json`."""
         return run_directory.read_config_file(self.path / "summary.json")["members"]
+
+    def plot(self) -> Any:
+        """Draws the learning curves, mean and seeds of each arm, as a matplotlib figure.
+
+        Raises:
+          SaunaError: no episode has finished.
+        """
+        figure = curve_figure(self.path)
+        if figure is None:
+            raise SaunaError(f"{self.path}: no episode has finished, so there is no curve")
+        return figure
+
+    def table(self, of: str = "members") -> Any:
+        """A pandas DataFrame, or a list of dicts if pandas is not installed.
+
+        Args:
+          of: "members": the final numbers of each; "metrics": the rows of `metrics.jsonl`.
+
+        Raises:
+          BadInput: `of` is something else.
+        """
+        if of not in ("members", "metrics"):
+            raise BadInput(f"table: of must be 'members' or 'metrics', not {of!r}")
+        rows = self.metrics
+        if of == "members":
+            rows = [{"member": name, **numbers} for name, numbers in self.summary.items()]
+        try:
+            import pandas
+        except ImportError:
+            return rows
+        return pandas.DataFrame(rows)
 
     def policy(self, member: int | str = 0) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`."""

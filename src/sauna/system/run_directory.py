@@ -6,7 +6,8 @@ metrics.jsonl   one row per iteration and member; the same bytes for the same co
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
 summary.json    how each member ended
 checkpoints/    see checkpoint.py
-figures/, videos/, tensorboard/
+tracking.json   how each tracker finds its run again
+figures/, videos/, tensorboard/, wandb/
 """
 
 from __future__ import annotations

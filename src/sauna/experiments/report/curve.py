@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +48,29 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def draw_curve(run: Path) -> Path | None:
     """Draws `figures/learning_curve.png` of a run; None if no episode has finished."""
+    figure = curve_figure(run)
+    return figure and _saved(figure, run / "figures" / "learning_curve.png")
+
+
+def curve_figure(run: Path) -> Any:
+    """The learning curves of a run as a matplotlib figure; None if no episode has finished.
+
+    A notebook shows it, as the figure says what it looks like (`_repr_png_`).
+    """
     curves = member_curves(run_directory.rows(run))
     if not curves:
         return None
     config = run_directory.read_config(run, needed=("config",))["config"]
     title = f"{config['env']}, preset {config['preset']}"
-    path = run / "figures" / "learning_curve.png"
-    return _draw(curves, {arm: arm for arm in curves}, title, TRAINING_RETURN, path)
+    figure = _figure(curves, {arm: arm for arm in curves}, title, TRAINING_RETURN)
+    figure._repr_png_ = partial(_png, figure)
+    return figure
+
+
+def _png(figure: Any) -> bytes:
+    with style.applied(), io.BytesIO() as file:
+        figure.savefig(file, format="png")
+        return file.getvalue()
 
 
 def plot(paths: Sequence[Path], out: str = "", tag: str = "") -> Path:
@@ -78,16 +96,21 @@ def draw_sources(sources: list[Source], path: Path) -> Path:
     tasks = list(dict.fromkeys(source.task for source in sources if source.task))
     known = all(source.arm for source in sources)
     arms = {source.label: source.arm or source.label for source in sources}
-    return _draw(curves, arms, ", ".join(tasks), TRAINING_RETURN if known else "return", path)
+    y_label = TRAINING_RETURN if known else "return"
+    return _saved(_figure(curves, arms, ", ".join(tasks), y_label), path)
 
 
-def _draw(
+def _saved(figure: Any, path: Path) -> Path:
+    with style.applied():
+        return style.save(figure, path)
+
+
+def _figure(
     curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
     arms: Mapping[str, str],
     title: str,
     y_label: str,
-    path: Path,
-) -> Path:
+) -> Any:
     from matplotlib.figure import Figure
 
     looks = style.looks(arms)
@@ -101,7 +124,7 @@ def _draw(
         axes.set_title(title)
         axes.legend()
         style.count_steps(axes)
-        return style.save(figure, path)
+    return figure
 
 
 def _draw_arm(
