@@ -188,10 +188,10 @@ MUTANTS = [
         ("no Vex loss", "vex_loss, mean_entropy, hypers)", "0.0 * vex_loss, mean_entropy, hypers)"),
     ),
     *_of(
-        "algorithm/learner/update.py",
+        "algorithm/learner/optimizers.py",
         "a2c",
-        ("RMSProp starts at 0", "initial_scale=1.0", "initial_scale=0.0"),
-        ("epsilon beside the root", "eps_in_sqrt=True", "eps_in_sqrt=False"),
+        ("RMSProp starts at 0", '"initial_scale": 1.0', '"initial_scale": 0.0'),
+        ("epsilon beside the root", '"eps_in_sqrt": True', '"eps_in_sqrt": False'),
     ),
     *_of(
         "algorithm/policy/normalize.py",
@@ -373,13 +373,12 @@ MUTANTS = [
         ("random drop inverted", ">= hypers.drop_rate", "< hypers.drop_rate"),
     ),
     *_of(
-        "training/loop/budget.py",
-        "vex_filter coverage",
-        (
-            "schedule the other way",
-            '"rising": threshold * (1.0 - left)',
-            '"rising": threshold * left',
-        ),
+        "training/loop/schedules.py",
+        "vex_filter schedules coverage",
+        ("schedule the other way", "value * (1.0 - left)", "value * left"),
+        ("half a cosine", "1.0 + cos(np.pi", "1.0 + cos(0.5 * np.pi"),
+        ("the warm-up counts from the start", "(used + coming)", "used"),
+        ("no schedule after the warm-up", "left / (1.0 - config.warmup)", "left"),
     ),
     *_of(
         "algorithm/selection/gigaflow.py",

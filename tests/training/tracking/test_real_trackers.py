@@ -91,7 +91,10 @@ def test_wandb_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
                 seen.setdefault(name, []).append(point)
     for seed in (0, 1):
         check(seen[f"{tmp_path.name} ppo/{seed}"], seed)
-    assert len(list((tmp_path / "wandb").glob("*/files/media/images/learning_curve*.png"))) == 2
+    assert (
+        len(list((tmp_path / "wandb").glob("offline-run-*/files/media/images/learning_curve*.png")))
+        == 2
+    )
 
 
 def test_trackio_local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
