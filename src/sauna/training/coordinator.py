@@ -73,8 +73,8 @@ class Coordinator:
             display.say("warning: not an exact resume: every environment starts a new episode")
         self._workers = [self._start(part, loaded, replay) for part in self._parts]
         self._watchdog = Watchdog(self._workers)
-        own = (run.path, run.config, run.members, display.say)
-        self._trackers = Trackers(*own, tracked if replay else {})
+        done = tracked if replay else {}
+        self._trackers = Trackers(run.path, run.config, run.members, display.say, done)
 
     def _start(
         self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
@@ -124,6 +124,7 @@ class Coordinator:
         self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
             self._grant()
+            self._trackers.open()  # while the workers compile
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None

@@ -42,6 +42,7 @@ def track_twice(path: Path, name: str) -> list[str]:
     said: list[str] = []
     for number, steps in enumerate([(10, 20), (30,)]):
         trackers = Trackers(path, run.config, run.members, said.append, {})
+        trackers.open()
         trackers.rows(rows(*steps), 100.0)
         if number:
             trackers.summary({f"ppo/{seed}": {"return_mean": 1.5} for seed in (0, 1)}, True)
@@ -142,6 +143,7 @@ from sauna.config.presets import resolve_run
 from sauna.training.tracking.trackers import Trackers
 run = resolve_run({"env": "x", "track": "wandb"})
 trackers = Trackers(Path.cwd(), run.config, run.members, print, {})
+trackers.open()
 trackers.rows([{"member": "ppo/0", "env_steps": 1, "kl": 0.1}], 100.0)
 trackers.close()
 """

@@ -73,7 +73,9 @@ def opened(path: Path, names: str, done: dict[str, int] | None = None) -> tuple[
     track = ",".join(f"{__name__}:{name}" for name in names.split(","))
     run = resolve_run({"env": "x", "seeds": 2, "track": track, "track_project": "mine"})
     said: list[str] = []
-    return Trackers(path, run.config, run.members, said.append, done or {}), said
+    trackers = Trackers(path, run.config, run.members, said.append, done or {})
+    trackers.open()
+    return trackers, said
 
 
 def test_a_tracker_gets_rows_picture_and_summary_and_knows_the_run(tmp_path: Path) -> None:
@@ -106,6 +108,14 @@ def test_a_resumed_run_is_the_same_one_and_rows_that_come_again_are_left_out(tmp
     (one,) = Listed.made
     assert one.run.before["number"] == 7
     assert [call[2] for call in one.calls] == [20, 20]
+
+
+def test_a_damaged_record_of_the_trackers_is_named(tmp_path: Path) -> None:
+    (tmp_path / "tracking.json").write_text("{")
+    trackers, said = opened(tmp_path, "Listed")
+    trackers.rows(ROWS, 5.0)
+    assert said[0].startswith("warning: config: cannot read") and "begin anew" in said[0]
+    assert len(Listed.made[0].calls) == 2
 
 
 def test_a_tracker_that_is_new_to_a_run_gets_the_rows_of_before(tmp_path: Path) -> None:

@@ -86,22 +86,27 @@ class Trackers:
         say: Callable[[str], None],
         done: Mapping[str, int],
     ) -> None:
-        self._say = say
-        self._open: dict[str, Tracker] = {}
-        self._done: dict[str, Mapping[str, int]] = {}
-        self.urls: dict[str, dict[str, str]] = {}
-        if not chosen(config):
-            return
-        settings = {
+        self._path, self._config, self._say = path, config, say
+        self._members = {
             one.name: {**to_json(one.config), "member": one.name, "arm": one.arm, "seed": one.seed}
             for one in members
         }
-        file = path / FILE
-        kept = run_directory.read_config_file(file) if file.exists() else {}
-        for name in chosen(config):
-            run = TrackedRun(path, config.track_project, settings, kept.get(name, {}))
-            self._done[name] = done if name in kept else {}
-            earlier = [] if name in kept else run_directory.rows(path)
+        self._before = done
+        self._done: dict[str, Mapping[str, int]] = {}
+        self._open: dict[str, Tracker] = {}
+        self.urls: dict[str, dict[str, str]] = {}
+
+    def open(self) -> None:
+        """Opens all of them, which may take a while; before it, and without it, there are none."""
+        names = chosen(self._config)
+        if not names:
+            return
+        kept = self._kept()
+        for name in names:
+            before = kept.get(name)
+            self._done[name] = {} if before is None else self._before
+            earlier = run_directory.rows(self._path) if before is None else []
+            run = TrackedRun(self._path, self._config.track_project, self._members, before or {})
             try:
                 self._open[name] = tracker = _made(name)
                 kept[name] = tracker.open(run)
@@ -112,8 +117,17 @@ class Trackers:
                 continue
             if urls := kept[name].get("urls"):
                 self.urls[name] = urls
-                say(f"{name}: {', '.join(dict.fromkeys(urls.values()))}")
-        run_directory.write_json(file, kept)
+                self._say(f"{name}: {', '.join(dict.fromkeys(urls.values()))}")
+        run_directory.write_json(self._path / FILE, kept)
+
+    def _kept(self) -> dict[str, Any]:
+        """What the trackers of before have left, by which they find the run again."""
+        file = self._path / FILE
+        try:
+            return run_directory.read_config_file(file) if file.exists() else {}
+        except BadInput as error:
+            self._say(f"warning: {error}; trackers begin anew")
+            return {}
 
     def rows(self, rows: Sequence[Mapping[str, Any]], steps_per_second: float) -> None:
         """Takes the rows of one iteration."""
