@@ -25,6 +25,7 @@ from measured_pages import noise_page, posture_page, sweep_page
 from studies import MEASURED, ROOT, STUDIES, load, page_of
 from study_pages import pong_text, ppo_page, study_page
 from summary_page import findings, index
+from zoo_page import draw_zoo, zoo_page
 
 from sauna.experiments.report.figures import draw_plots, write_figures
 from sauna.experiments.report.page import rounded
@@ -153,6 +154,9 @@ def write_pages() -> None:
         if measured := load(name):
             measured_figures(name, measured)
             (PAGES / page_of(name)).write_text(make(measured))
+    if zoo := load("zoo"):
+        draw_zoo(zoo["units"], FIGURES / "zoo.svg")
+        (PAGES / "zoo.md").write_text(zoo_page(zoo["units"]))
     covered = json.loads((ROOT / "results" / "intervals.json").read_text())["iqm_of_normals"]["6"]
     (PAGES / "index.md").write_text(index(covered))
     insert(ROOT / "README.md", "findings", findings("docs/results/"))
