@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from studies import listed, markdown, page
+from studies import listed, load, markdown, page
 
 from sauna.config.zoo import ENVS, PUBLISHED, entry_of, shown_published
 from sauna.experiments.report import style
@@ -24,20 +24,22 @@ def zoo_page(units: Mapping[str, Any]) -> str:
     """The page, from the units of `results/zoo.json`."""
     done = [env for env in ENVS if env in units]
     missing = [env for env in ENVS if env not in units]
+    below = [f"`{env}`: {_word(env)}" for env in done if _is_below(env, units)]
     figure = "![Training curves of three seeds each](figures/zoo.svg)\n\n" + CAPTION
     return page(
         "zoo",
         figure=figure if done else "",
         table=markdown([HEAD, *(_row(env, units[env]) for env in done)]),
-        words=listed(f"{env}: {_word(env, units[env])}" for env in done if _is_below(env, units)),
+        words=listed(below) if below else "None so far.",
+        seconds=_seconds(),
         missing=markdown(
             [["Environment", "Preset", "Env steps", "RL Zoo"], *map(_missing, missing)]
         ),
     )
 
 
-CAPTION = """*Training return of the last 100 episodes (actions sampled), three seeds. Grey: RL Zoo's
-return and its spread.*"""
+CAPTION = """*Training return of the last 100 episodes (actions sampled), three seeds. Grey: the return
+and the spread that RL Zoo publishes.*"""
 HEAD = [
     "Environment",
     "Preset",
@@ -81,8 +83,26 @@ def _is_below(env: str, units: Mapping[str, Any]) -> bool:
     return np.mean(returns) < published.mean - max(published.std, np.std(returns, ddof=1))
 
 
-def _word(env: str, unit: Mapping[str, Any]) -> str:
+def _word(env: str) -> str:
     return WORDS.get(env, "**not explained yet**.")
+
+
+def _seconds() -> str:
+    """Training seconds beside Stable-Baselines3's; empty if they were not measured."""
+    found = load("zoo_seconds")
+    if not found:
+        return ""
+    rows = [["Environment", "Seconds here", "Seconds, SB3", "Return here", "Return, SB3"]]
+    for env, pair in found["tasks"].items():
+        numbers = [pair[side][name] for name in ("seconds", "return") for side in ("ours", "sb3")]
+        rows.append([f"`{env}`", *(f"{number:,.1f}" for number in numbers)])
+    text = (
+        f"## Seconds beside Stable-Baselines3\n\nThe same numbers, {found['seeds']} seeds of "
+        f"{found['steps']:,} env steps, two processes, one side after the other. Seconds are those "
+        "from the command to its end, with imports and compilation. A return is the mean training "
+        "return of the last 100 episodes."
+    )
+    return f"{text}\n\n{markdown(rows)}"
 
 
 def draw_zoo(units: Mapping[str, Any], path: Path) -> Path:
