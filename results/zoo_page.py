@@ -38,8 +38,8 @@ def zoo_page(units: Mapping[str, Any]) -> str:
     )
 
 
-CAPTION = """*Training return of the last 100 episodes (actions sampled), three seeds. Grey: the return
-and the spread that RL Zoo publishes.*"""
+CAPTION = """*Training return of the last 100 episodes (actions sampled), three seeds. Grey:
+the return and the spread that RL Zoo publishes.*"""
 HEAD = [
     "Environment",
     "Preset",
