@@ -262,7 +262,7 @@ def test_seed_and_batch_size_replace_what_a_file_says(tmp_path) -> None:
     file = tmp_path / "settings.json"
     file.write_text(json.dumps({"env": WORLD, "seeds": [1, 2], "minibatches": 4}))
     typed = {"seed": "7", "batch_size": "256"}
-    merged = cli._over(cli._overrides_in(str(file), trust=True), typed)
+    merged = translate(cli._over(cli._overrides_in(str(file), trust=True), typed))
     assert merged == {"env": WORLD, "seeds": (7,), "minibatches": 8}
 
 

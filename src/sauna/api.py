@@ -149,8 +149,8 @@ def compare(
     for name in PARTS:
         if is_local(str(overrides.get(name))):
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
-    task = overrides.pop("env")
     overrides = translate(overrides)
+    task = overrides.pop("env")
     arms, parsed = (arms,) if isinstance(arms, str) else tuple(arms), parse_all(overrides)
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(task, chosen, parsed, is_tournament)

@@ -251,7 +251,7 @@ def _train(values: dict[str, Any]) -> None:
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
-    """Puts what is typed over what a file says; `--seed` and `--batch-size` count as typed."""
+    """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
     replaced = {"seed": "seeds", "batch_size": "minibatches"}
     gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
     return {k: v for k, v in stored.items() if k not in gone} | typed
@@ -332,7 +332,8 @@ def _compare(values: dict[str, Any]) -> None:
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
-    values = translate(values)
+    values = translate({"env": env, **values})
+    del values["env"]
     parsed = parse_all(values)
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(env, chosen, parsed, is_tournament)

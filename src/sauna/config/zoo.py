@@ -29,6 +29,11 @@ class Entry(NamedTuple):
     steps: int  # env steps of a member, if nobody says otherwise
     source: str  # of the preset's numbers
 
+    def said(self, env: str, steps_named: bool) -> str:
+        """Says in one line what is picked for an environment, and whose numbers they are."""
+        steps = "" if steps_named else f", {self.steps:,} env steps"
+        return f"preset {self.preset} for {env} ({self.source}){steps}"
+
 
 MUJOCO = (
     "Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum|InvertedPendulum|"

@@ -47,9 +47,8 @@ def pick(overrides: Mapping[str, Any]) -> Picked:
         return Picked(given)
     entry = entry_of(str(env))
     if entry is not None:
-        steps = "" if "steps" in given else f", {entry.steps:,} env steps"
-        said = f"preset {entry.preset} for {env} ({entry.source}){steps}"
-        return Picked({**given, "preset": AUTO}, f"{said}; --preset names another")
+        said = f"{entry.said(str(env), 'steps' in given)}; --preset names another"
+        return Picked({**given, "preset": AUTO}, said)
     if given.get("distributed"):  # no machine may touch its accelerator before all have joined
         return Picked({**given, "preset": Config.preset})
     found = _look(given)
