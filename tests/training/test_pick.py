@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
+import sauna
+from sauna import cli
 from sauna.config.presets import resolve
 from sauna.system.errors import BadInput
 from sauna.training import pick as module
@@ -60,3 +64,22 @@ def test_a_mistake_is_found_before_the_environment_is_made() -> None:
     ):
         with pytest.raises(BadInput, match=said):
             pick(wrong)
+
+
+def test_both_interfaces_pick_and_say_so(monkeypatch, capsys, tmp_path) -> None:
+    started = []
+
+    def start(overrides, display, found):
+        started.append(overrides)
+        return SimpleNamespace(path=tmp_path)
+
+    monkeypatch.setattr("sauna.training.run.start", start)
+    monkeypatch.setattr("sauna.api.train_and_draw", lambda *_, **__: None)
+    sauna.train("CartPole-v1", batch_size=128)
+    cli.main(["train", "CartPole-v1", "--batch-size", "128"])
+    said = "preset cartpole for CartPole-v1 (RL Zoo's numbers), 100,000 env steps"
+    assert capsys.readouterr().out.count(said) == 2
+    assert started == [{"env": "CartPole-v1", "preset": "auto", "minibatches": 2}] * 2
+    sauna.train("CartPole-v1", preset="mujoco", quiet=True)
+    assert started[-1] == {"env": "CartPole-v1", "preset": "mujoco"}
+    assert "preset" not in capsys.readouterr().out

@@ -35,8 +35,10 @@ def test_without_auto_nothing_is_picked() -> None:
     assert {check(arm, task).preset for arm in spec.arms for task in TASKS} == {"mujoco"}
     assert not [note for note in before_training(spec) if note.startswith("preset")]
     named = read_spec(study(preset="mujoco"))
-    assert study_identity(spec) == study_identity(named) != study_identity(
-        read_spec(study(preset="auto"))
+    assert (
+        study_identity(spec)
+        == study_identity(named)
+        != study_identity(read_spec(study(preset="auto")))
     )
 
 
