@@ -83,10 +83,11 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
       BadInput: a setting is not usable; nothing was created.
       SaunaError: training failed; the last good checkpoint is on disk.
     """
-    picked = pick({"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}})
+    given = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
+    if given.get("out") is not None:
+        given["out"] = str(given["out"])
+    picked = pick(given)
     overrides = translate(picked.overrides)
-    if overrides.get("out") is not None:
-        overrides["out"] = str(overrides["out"])
     display: Display = _Silent() if quiet else make_display()
     run = runs.start(overrides, display, picked.found)
     if picked.said:
