@@ -242,6 +242,10 @@ def test_help_shows_what_most_need_first_with_types_and_the_presets_values() -> 
     assert "(default 0.2)" in help_of("train")
     assert "(default 16)" in help_of("train", "--algorithm=a2c")
     assert "--clip-range" in help_of("train", "--preset", "no such")  # is refused later
+    lunar = help_of("train", "LunarLander-v3", "--arm", "sauna")
+    assert "preset lunar-lander" in lunar and "discount (default 0.999)" in lunar
+    own = help_of("train", "my_module:MyEnv", "--arm", "sauna")
+    assert "preset mujoco" in own and "(default sauna)" in own
 
 
 def test_compare_says_its_own_defaults() -> None:

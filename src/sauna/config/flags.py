@@ -11,7 +11,7 @@ from typing import Any
 from sauna.config.fields import GROUPS
 from sauna.config.presets import arm_config
 from sauna.config.settings import FIELDS, TYPES, Config, flag
-from sauna.config.zoo import AUTO
+from sauna.config.zoo import AUTO, entry_of
 from sauna.system.errors import BadInput
 
 FIRST = "most needed"
@@ -87,7 +87,7 @@ def metavar(name: str) -> str:
 
 
 def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, Any]:
-    """Finds the defaults that hold for a command line: those of the arm and preset it names.
+    """Finds the defaults that hold for a command line: of the arm, preset or environment it names.
 
     Args:
       arguments: all of them; what is wrong in them is found later.
@@ -102,7 +102,8 @@ def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, 
         named, _ = reader.parse_known_args(list(arguments))
         own = ("preset", "algorithm")
         preset = {n: v for n in own if (v := getattr(named, n)) is not None}
-        if named.command == "train" and named.env and "preset" not in preset:
+        known = named.command == "train" and entry_of(named.env or "") is not None
+        if known and "preset" not in preset:
             preset |= {"env": named.env, "preset": AUTO}
         first = arm or str(named.arm or Config.arm[0]).split(",")[0]
         config = arm_config(first, preset)
