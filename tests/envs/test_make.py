@@ -125,8 +125,7 @@ def test_an_id_that_this_program_registered_trains_in_it(tmp_path: Path) -> None
     try:
         assert known_in_this_process_alone("ShortPole-v0")
         assert not known_in_this_process_alone("CartPole-v1")
-        settings = {**SMALL, "preset": "mujoco", "quiet": True}
-        run = sauna.train("ShortPole-v0", out=tmp_path / "run", **settings)
+        run = sauna.train("ShortPole-v0", quiet=True, out=tmp_path / "run", **SMALL)
         lengths = [n for row in run.metrics for n in row["episode_lengths"]]
         assert lengths and set(lengths) == {3}
         with pytest.raises(BadInput, match="other processes cannot import it"):

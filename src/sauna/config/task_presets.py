@@ -135,9 +135,10 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
     },
     # Own numbers: preset `mujoco` on eight environments.
     "robotics": {"envs": 8, "rollout_steps": 256},
-    # Preset `mujoco` on eight environments instead of one, so that an update sees several episodes.
-    "discrete": {"envs": 8, "rollout_steps": 256, "entropy_coef": 0.01},
-    "long-horizon": {"envs": 8, "rollout_steps": 1024, "minibatches": 64, "gamma": 0.999},
+    # Of an unknown environment: preset `mujoco`, which makes one copy of it, and what its spaces or
+    # its time limit ask for besides. A longer rollout sees several of its episodes.
+    "discrete": {"entropy_coef": 0.01},
+    "long-horizon": {"rollout_steps": 8192, "minibatches": 128, "gamma": 0.999},
     # Preset `atari` without what is special to Atari: the size of rewards is kept.
     "pictures": {
         "envs": 8,
@@ -166,7 +167,7 @@ TASK_PRESET_HELP = {
     "minigrid-long": "the same with rollouts of 512 steps (FourRooms, RedBlueDoors)",
     "playground": "MuJoCo Playground's control tasks: 2048 environments on an accelerator",
     "robotics": "dense reaching tasks of Gymnasium-Robotics: eight environments",
-    "discrete": "discrete actions: eight environments, an entropy bonus",
-    "long-horizon": "episodes of more than 1000 steps: eight environments, discount 0.999",
+    "discrete": "discrete actions: as mujoco, with an entropy bonus",
+    "long-horizon": "episodes of more than 1000 steps: rollouts of 8192 steps, discount 0.999",
     "pictures": "pictures: Nature CNN, eight environments",
 }

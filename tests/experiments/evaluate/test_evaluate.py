@@ -20,7 +20,7 @@ from sauna.experiments.evaluate.video import frame, frames_per_second, video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 
-SETTINGS = {**SMALL, "preset": "mujoco", "processes": 1, "arm": "ppo", "steps": 96}
+SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 96}
 
 
 @pytest.fixture(scope="module")
