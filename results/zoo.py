@@ -108,11 +108,14 @@ def sauna(*arguments: str) -> int:
     return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode
 
 
-def train(env: str, run: Path) -> None:
+def train(env: str, run: Path) -> bool:
     """Trains three seeds, or continues them; notes the seconds of each part.
 
+    Returns:
+      whether the run is complete.
+
     Raises:
-      SystemExit: it was stopped or failed.
+      SystemExit: it was stopped.
     """
     notes = run.with_name(f"{run.name}_seconds.json")
     parts = json.loads(notes.read_text()) if notes.exists() else []
@@ -122,8 +125,9 @@ def train(env: str, run: Path) -> None:
     code = sauna(*how, *(() if begun else ("--out", str(run))))
     parts.append({"wall": time.monotonic() - before, "cpu": _cpu_seconds() - cpu})
     notes.write_text(json.dumps(parts))
-    if code:
+    if code in (130, 143) or code < 0:
         sys.exit(code)
+    return code == 0
 
 
 def _cpu_seconds() -> float:
@@ -185,8 +189,9 @@ def main() -> None:
         if is_done(env, entry):
             continue
         run = RUNS / f"{env.replace('/', '-')}_{digest_of(settings_of(entry))}"
-        if not run_directory.is_complete(run):
-            train(env, run)
+        if not run_directory.is_complete(run) and not train(env, run):
+            print(f"{env}: failed; the next one", flush=True)
+            continue
         unit = measure(entry, run)
         store({**stored(), env: unit})
         print(f"{env}: {unit['returns']} after {unit['wall_seconds']:.0f} s", flush=True)
