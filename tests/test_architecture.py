@@ -14,6 +14,7 @@ EDGES = module_edges(SOURCE)
 FLOORS = (
     "system",
     "config",
+    "envs.registration",
     "envs.spaces",
     "envs.device",
     "envs.flagrun",
