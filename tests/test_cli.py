@@ -148,6 +148,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
         "checkpoints",
         "config.json",
         "figures",
+        "metrics.csv",
         "metrics.jsonl",
         "summary.json",
         "timing.jsonl",
