@@ -104,7 +104,7 @@ def test_links_and_devices_are_not_followed(tmp_path: Path) -> None:
 
 
 def test_no_folder_and_no_runs(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is not a folder"):
+    with pytest.raises(BadInput, match="there is no folder"):
         list_runs(tmp_path / "none")
     assert list_runs(tmp_path) == [f"no runs in {tmp_path}"]
     assert [age(s) for s in (-1, 59, 60, 7300, 900_000)] == ["0 s", "59 s", "1 min", "2 h", "10 d"]

@@ -53,7 +53,7 @@ def list_runs(folder: Path) -> list[str]:
       BadInput: there is no such folder.
     """
     if not folder.is_dir():
-        raise BadInput(f"runs: {folder} is not a folder")
+        raise BadInput(f"runs: there is no folder {folder}")
     runs = sorted(map(examine, find_runs(folder)), key=lambda run: -run.changed)
     if not runs:
         return [f"no runs in {folder}"]
