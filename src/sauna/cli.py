@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | plot | study | ...`.
+"""The command line: `sauna train | resume | eval | inspect | compare | plot | runs | study | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -146,9 +146,15 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
 
     text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
     plot = commands.add_parser("plot", help=text, allow_abbrev=False)
-    plot.add_argument("runs", nargs="+", metavar="RUN")
+    text = "a run directory, a CSV file (seed, step, return), or TensorBoard files or their folder"
+    plot.add_argument("runs", nargs="+", metavar="RUN", help=text)
     plot.add_argument("--out", default="", metavar="FILE", help="the figure, .png or .svg")
     plot.add_argument("--tag", default="", help="of the returns in TensorBoard files")
+
+    text = "what runs a folder holds, how far each is and how it went"
+    runs = commands.add_parser("runs", help=text, allow_abbrev=False)
+    text = "the folder, searched with those below (default runs)"
+    runs.add_argument("folder", nargs="?", metavar="DIR", default="runs", help=text)
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, usage=usage % "bench", allow_abbrev=False)
@@ -346,6 +352,12 @@ def _plot(values: dict[str, Any]) -> None:
     print(f"figure: {plot([*map(Path, values['runs'])], values['out'], values['tag'])}")
 
 
+def _runs(values: dict[str, Any]) -> None:
+    from sauna.experiments.run_list import list_runs
+
+    print("\n".join(list_runs(Path(values["folder"]))))
+
+
 def _study(values: dict[str, Any]) -> None:
     from sauna.experiments.study.command import check_study, load_spec, study_command
 
@@ -392,6 +404,7 @@ _COMMANDS = {
     "inspect": _inspect,
     "compare": _compare,
     "plot": _plot,
+    "runs": _runs,
     "study": _study,
     "bench": _bench,
     "list": _list,
