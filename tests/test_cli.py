@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from command_line import sauna, small_flags
+from command_line import sauna, sauna_here, small_flags
 from sauna import cli
 from sauna.config.accepted import translate
 from sauna.config.other_names import ACCEPTED, ADVICE, SAME
@@ -159,18 +159,18 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
     assert (run / "figures" / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
     again = sauna("train", WORLD, "--out", str(run), cwd=tmp_path)
     assert again.returncode == 2 and f"sauna resume {run}" in again.stderr
-    assert "nothing to do" in sauna("resume", str(run), cwd=tmp_path).stdout
+    assert "nothing to do" in sauna_here("resume", str(run), cwd=tmp_path).stdout
     for mode in ("sampled", "deterministic"):
         more = ["--deterministic"] if mode == "deterministic" else []
-        done = sauna("eval", str(run), "--episodes", "3", *more, cwd=tmp_path)
+        done = sauna_here("eval", str(run), "--episodes", "3", *more, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         assert f"{mode} actions, frozen normaliser" in done.stdout
         assert "sauna/1: return" in done.stdout and "length" in done.stdout
         stored = json.loads((run / f"evaluation_{mode}.json").read_text())
         assert stored["mode"] == mode and len(stored["members"]["sauna/0"]["returns"]) == 3
-    done = sauna("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
+    done = sauna_here("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
     assert done.returncode == 2 and "did you mean 'sauna/" in done.stderr
-    done = sauna("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
+    done = sauna_here("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
     assert done.returncode == 2 and "other spaces than the run: observation shape" in done.stderr
 
 
