@@ -45,7 +45,12 @@ class Config:
         choices=("ppo", "a2c"),
         shapes_program=True,
     )
-    preset: str = _run("mujoco", "settings to start from; with A2C, preset a2c", common=True)
+    preset: str = _run(
+        "mujoco",
+        "settings to start from, see `sauna list presets`; auto: those of the environment, as "
+        "`train` takes if none is named (with A2C: a2c)",
+        common=True,
+    )
     seeds: tuple[int, ...] = _run(
         (0,),
         "how many seeds (6: seeds 0 to 5; 42: 42 of them), or which ones (100,101,110)",
@@ -157,8 +162,7 @@ class Config:
     )
     learning_rate_schedule: str = _learning(
         "linear",
-        "over the budget of steps: to 0 (linear, cosine), constant, a factor of your own, or moved "
-        "to hold a KL divergence (kl)",
+        "over the budget of steps: to 0, constant, as a function says, or held by the KL (kl)",
         choices=("linear", "constant", "cosine", "kl"),
         plugin=True,
     )

@@ -21,6 +21,7 @@ from sauna.config.presets import resolve_run
 from sauna.training.tracking.trackers import Trackers
 
 pytestmark = pytest.mark.slow
+CLOCK = {"steps_per_second": 100.0, "wall_seconds": 2.0}
 BLOCK, HEADER = 32768, 7  # of LevelDB's log format, in which wandb writes
 
 
@@ -43,7 +44,7 @@ def track_twice(path: Path, name: str) -> list[str]:
     for number, steps in enumerate([(10, 20), (30,)]):
         trackers = Trackers(path, run.config, run.members, said.append, {})
         trackers.open()
-        trackers.rows(rows(*steps), 100.0)
+        trackers.rows(rows(*steps), CLOCK)
         if number:
             trackers.summary({f"ppo/{seed}": {"return_mean": 1.5} for seed in (0, 1)}, True)
             trackers.picture("learning_curve", figure)
@@ -144,7 +145,7 @@ from sauna.training.tracking.trackers import Trackers
 run = resolve_run({"env": "x", "track": "wandb"})
 trackers = Trackers(Path.cwd(), run.config, run.members, print, {})
 trackers.open()
-trackers.rows([{"member": "ppo/0", "env_steps": 1, "kl": 0.1}], 100.0)
+trackers.rows([{"member": "ppo/0", "env_steps": 1, "kl": 0.1}], {})
 trackers.close()
 """
 

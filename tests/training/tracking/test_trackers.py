@@ -65,6 +65,7 @@ def row(member: str, steps: int) -> dict[str, Any]:
 
 
 ROWS = [row("ppo/0", 10), row("ppo/1", 10)]
+CLOCK = {"steps_per_second": 5.0, "wall_seconds": 2.0}
 LATER = [row("ppo/0", 20), row("ppo/1", 20)]
 
 
@@ -80,7 +81,7 @@ def opened(path: Path, names: str, done: dict[str, int] | None = None) -> tuple[
 
 def test_a_tracker_gets_rows_picture_and_summary_and_knows_the_run(tmp_path: Path) -> None:
     trackers, said = opened(tmp_path, "Listed")
-    trackers.rows(ROWS, 5.0)
+    trackers.rows(ROWS, CLOCK)
     trackers.summary({"ppo/0": {"return_mean": 1.0}}, True)
     trackers.picture("learning_curve", tmp_path / "x.png")
     trackers.close()
@@ -103,8 +104,8 @@ def test_a_tracker_gets_rows_picture_and_summary_and_knows_the_run(tmp_path: Pat
 def test_a_resumed_run_is_the_same_one_and_rows_that_come_again_are_left_out(tmp_path) -> None:
     opened(tmp_path, "Listed")[0].close()
     trackers, _ = opened(tmp_path, "Listed", last_steps(ROWS))
-    trackers.rows(ROWS, 5.0)
-    trackers.rows(LATER, 5.0)
+    trackers.rows(ROWS, CLOCK)
+    trackers.rows(LATER, CLOCK)
     (one,) = Listed.made
     assert one.run.before["number"] == 7
     assert [call[2] for call in one.calls] == [20, 20]
@@ -113,7 +114,7 @@ def test_a_resumed_run_is_the_same_one_and_rows_that_come_again_are_left_out(tmp
 def test_a_damaged_record_of_the_trackers_is_named(tmp_path: Path) -> None:
     (tmp_path / "tracking.json").write_text("{")
     trackers, said = opened(tmp_path, "Listed")
-    trackers.rows(ROWS, 5.0)
+    trackers.rows(ROWS, CLOCK)
     assert said[0].startswith("warning: config: cannot read") and "begin anew" in said[0]
     assert len(Listed.made[0].calls) == 2
 
@@ -122,7 +123,7 @@ def test_a_tracker_that_is_new_to_a_run_gets_the_rows_of_before(tmp_path: Path) 
     lines = "".join(json.dumps(one) + "\n" for one in ROWS)
     (tmp_path / "metrics.jsonl").write_text(lines)
     trackers, _ = opened(tmp_path, "Listed", last_steps([*ROWS, *LATER]))
-    trackers.rows(LATER, 5.0)
+    trackers.rows(LATER, CLOCK)
     (one,) = Listed.made
     assert [call[1:3] for call in one.calls] == [
         (r["member"], r["env_steps"]) for r in ROWS + LATER
@@ -132,8 +133,8 @@ def test_a_tracker_that_is_new_to_a_run_gets_the_rows_of_before(tmp_path: Path) 
 @pytest.mark.parametrize("failing, why", [("Failing", "no network"), ("NotOpen", "no key")])
 def test_a_failing_tracker_ends_alone_with_one_line(tmp_path: Path, failing: str, why: str) -> None:
     trackers, said = opened(tmp_path, f"{failing},Listed")
-    trackers.rows(ROWS, 5.0)
-    trackers.rows(LATER, 5.0)
+    trackers.rows(ROWS, CLOCK)
+    trackers.rows(LATER, CLOCK)
     trackers.close()
     warnings = [text for text in said if text.startswith("warning")]
     assert warnings == [

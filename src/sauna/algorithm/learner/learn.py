@@ -12,6 +12,7 @@ from sauna.algorithm.learner.metrics import (
     UpdateMetrics,
     Work,
     head_statistics,
+    policy_std,
     variance_explained,
 )
 from sauna.algorithm.learner.optimizers import moves_rate
@@ -67,6 +68,7 @@ def learn(
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
         state.learning_rate if moves_rate(config) else jnp.float32(jnp.nan),
+        policy_std(parts.policy.unravel(state.params)),
         sound & jnp.all(jnp.isfinite(state.params)),
         work,
     )

@@ -45,7 +45,7 @@ class Tracker:
         return {}
 
     def row(self, row: Mapping[str, Any]) -> None:
-        """Takes a row of `metrics.jsonl`, with `steps_per_second`; see `scalars`."""
+        """Takes a row of `metrics.jsonl`, and `steps_per_second` and `wall_seconds` with it."""
 
     def picture(self, name: str, path: Path) -> None:
         """Takes a figure of the whole run, a PNG file."""

@@ -129,10 +129,10 @@ class Trackers:
             self._say(f"warning: {error}; trackers begin anew")
             return {}
 
-    def rows(self, rows: Sequence[Mapping[str, Any]], steps_per_second: float) -> None:
-        """Takes the rows of one iteration."""
+    def rows(self, rows: Sequence[Mapping[str, Any]], timing: Mapping[str, float]) -> None:
+        """Takes the rows of one iteration, and what a clock says of it."""
         for row in rows:
-            whole = {**row, "steps_per_second": steps_per_second}
+            whole = {**row, **timing}
             for name in list(self._open):
                 if row["env_steps"] > self._done[name].get(row["member"], -1):
                     self._call(name, lambda tracker, row=whole: tracker.row(row))  # type: ignore[misc]
