@@ -40,6 +40,7 @@ _PARTS: dict[str, type] = {
     "drop_rates": list,
     "code": dict,
     "code_before": list,
+    "extended": list,
 }
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
@@ -224,6 +225,13 @@ def is_complete(run: Path) -> bool:
     """Whether the run was trained to its end."""
     path = run / "summary.json"
     return os.path.lexists(path) and bool(_read(path).get("complete"))
+
+
+def reopen_summary(run: Path) -> None:
+    """Notes that a run is not complete any more, as it is to go further."""
+    path = run / "summary.json"
+    if os.path.lexists(path):
+        write_json(path, {**_read(path), "complete": False})
 
 
 def versions() -> dict[str, str]:

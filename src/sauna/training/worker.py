@@ -38,6 +38,7 @@ class PipeReporter:
         self._inbox, self._outbox, self._dies_alone = inbox, outbox, dies_alone
         self._granted = 0
         self._stop = False
+        self._stopped: set[str] = set()
         self._changed = threading.Condition()
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -48,6 +49,7 @@ class PipeReporter:
                 with self._changed:
                     self._granted = header["granted"]
                     self._stop = header["stop"]
+                    self._stopped |= set(header.get("stopped", ()))
                     self._changed.notify()
         except (EOFError, OSError):
             if self._dies_alone:
@@ -63,6 +65,10 @@ class PipeReporter:
         with self._changed:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
             return max(self._granted - iteration, 0)
+
+    def stopped(self) -> set[str]:
+        with self._changed:
+            return set(self._stopped)
 
     def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         header = {"kind": "iteration", "iteration": iteration, "rows": rows, "timing": timing}

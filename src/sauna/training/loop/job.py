@@ -30,6 +30,9 @@ class Reporter(Protocol):
     def allowance(self, iteration: int) -> int:
         """Waits until `iteration` may start; returns how many may from there on. 0: stop."""
 
+    def stopped(self) -> set[str]:
+        """Names the members that a callback has stopped; right after `allowance`."""
+
     def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         """Reports a finished iteration."""
 
