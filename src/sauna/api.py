@@ -73,7 +73,12 @@ class _Silent(PlainDisplay):
 
 
 def train(
-    env: Any, *, quiet: bool = False, callback: Callback | None = None, **settings: Any
+    env: Any,
+    *,
+    quiet: bool = False,
+    callback: Callback | None = None,
+    trust: bool = False,
+    **settings: Any,
 ) -> Result:
     """Trains PPO (or A2C), with SAUNA or without, on `env` and returns the finished run.
 
@@ -82,6 +87,7 @@ def train(
       quiet: show nothing.
       callback: called with each row of `metrics.jsonl`, in their order; if it returns True, the
         row's member stops there. It runs in this process. An exception of its ends the run.
+      trust: the run of `init_from` may name code of another user's; none of it runs.
       **settings: any field of `sauna.config.settings.Config` (`arm="sauna"`, `seeds=6`,
         `steps=1_000_000`), `seed=7` for the one seed 7, `batch_size` for samples per minibatch;
         functions, flax modules, filters and targets may be passed by value.
@@ -94,7 +100,7 @@ def train(
     if overrides.get("out") is not None:
         overrides["out"] = str(overrides["out"])
     display: Display = _Silent() if quiet else make_display()
-    run = runs.start(overrides, display)
+    run = runs.start(overrides, display, trust)
     train_and_draw(run, display, resume=False, callback=callback)
     return Result(run.path)
 
@@ -226,8 +232,8 @@ def load(
       trust: the code that the run names may run, even if another user named it.
       **parts: those that were passed by value when the run started (`env`, `network`, ...).
     """
-    from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
+    from sauna.training.artifact import load_artifact
 
     artifact = load_artifact(Path(path), iteration=checkpoint, trust=trust)
     provide(Path(path), parts, PARTS)

@@ -245,14 +245,15 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training import run as runs
     from sauna.training.display import make_display
 
-    stored = _overrides_in(values.pop("config"), values.pop("trust"))
+    trust = values.pop("trust")
+    stored = _overrides_in(values.pop("config"), trust)
     env = values.pop("env")
     overrides = _over(stored, values | ({"env": env} if env else {}))
     display = make_display()
     if runs.follows(overrides):
         runs.follow(overrides, display)
         return
-    run = runs.start(overrides, display)
+    run = runs.start(overrides, display, trust)
     train_and_draw(run, display, resume=False)
     print(f"learning curve: {run.path}/figures/learning_curve.png")
 

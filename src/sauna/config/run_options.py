@@ -138,7 +138,8 @@ class RunOptions:
 
     init_from: str = _run(
         "",
-        "start from the weights of a trained run: RUN, or RUN/ARM/SEED for one member of it",
+        "start from the weights of a trained run: RUN, or RUN/ARM/SEED for one member of it; with "
+        "/best behind it, as of its best evaluation",
     )
     init_normalizer: str = _run(
         "observations",

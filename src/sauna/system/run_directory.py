@@ -6,6 +6,7 @@ metrics.jsonl   one row per iteration and member; the same bytes for the same co
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
 summary.json    how each member ended
 checkpoints/    see checkpoint.py
+init/           a checkpoint of what the run started from, with init_from
 figures/, videos/, tensorboard/
 """
 
@@ -20,6 +21,7 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import time
 from collections.abc import Mapping
@@ -42,6 +44,7 @@ _PARTS: dict[str, type] = {
     "code_before": list,
     "extended": list,
 }
+INITIAL = "init"  # the folder of what a run starts from
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -111,6 +114,7 @@ def discard(path: Path, made: bool) -> None:
     with contextlib.suppress(OSError):  # what went wrong is told already, and matters more
         (path / "config.json").unlink(missing_ok=True)
         (path / ".lock").unlink(missing_ok=True)
+        shutil.rmtree(path / INITIAL, ignore_errors=True)
         if made:
             path.rmdir()
 

@@ -51,6 +51,7 @@ class Coordinator:
         run: Run,
         display: Display,
         loaded: checkpoint.Checkpoint | None,
+        initial: Mapping[str, np.ndarray],
         inexact: bool,
         callback: Callback | None = None,
     ) -> None:
@@ -72,11 +73,12 @@ class Coordinator:
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
-        self._workers = [self._start(part, loaded, replay) for part in self._parts]
+        given = loaded.arrays if loaded else initial
+        self._workers = [self._start(p, given, loaded is not None, replay) for p in self._parts]
         self._watchdog = Watchdog(self._workers)
 
     def _start(
-        self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
+        self, part: np.ndarray, given: Mapping[str, np.ndarray], is_restored: bool, replay: bool
     ) -> Worker:
         run = self._run
         if local_parts(run.config):
@@ -86,7 +88,7 @@ class Coordinator:
         names = [run.members[index].name for index in part]
         arrays = {
             key: value
-            for key, value in (loaded.arrays if loaded else {}).items()
+            for key, value in given.items()
             if any(key.startswith(name + "/") for name in names)
         }
         header = write_job(
@@ -95,6 +97,7 @@ class Coordinator:
             [int(index) for index in part],
             self._iteration,
             replay,
+            is_restored,
         )
         try:
             worker.send(header, arrays)

@@ -33,6 +33,7 @@ from sauna.training.extension import (
     extension,
     goes_further,
 )
+from sauna.training.initial import read_initial, save_initial
 from sauna.training.loop.multihost import Follower, join, read_host_rank
 from sauna.training.prepare import (
     Prepared,
@@ -90,8 +91,11 @@ class Run:
         }
 
 
-def start(overrides: Mapping[str, Any], display: Display) -> Run:
+def start(overrides: Mapping[str, Any], display: Display, trust: bool = False) -> Run:
     """Starts a new run: everything is checked before anything is created.
+
+    Args:
+      trust: the code that the run of `init_from` names may be another user's.
 
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
@@ -103,6 +107,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         prepared = examine(placed, overrides)
         TensorBoard.check(prepared.config)
         check_own_parts(prepared)
+        initial = read_initial(prepared, display.say, trust)
     path, made = _make_directory(prepared.config)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
     path = Path.cwd() / path
@@ -113,12 +118,15 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         "versions": run_directory.versions(),
         "git": run_directory.git_revision(),
         "machine": run_directory.machine(),
+        **({"initial": initial[1]} if initial else {}),
     }
     stored["seal"] = seal(stored)
     with disk_errors(path):
         run = Run(path, prepared, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
+            if initial:
+                save_initial(path, initial[0], run.manifest())
             run_directory.write_config(path, {**stored, "code": run.code})
         except BaseException:
             run.lock.close()

@@ -18,6 +18,7 @@ from sauna.system.logs import check_logs, cut_logs, damage_of
 from sauna.training.coordinator import Callback, Coordinator
 from sauna.training.display import Display
 from sauna.training.extension import GOES_FURTHER
+from sauna.training.initial import load_initial
 from sauna.training.run import Run, disk_errors
 
 
@@ -67,7 +68,8 @@ def _train(
             return False
         loaded = _load(run, display)
         cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
-    with Coordinator(run, display, loaded, inexact, callback) as coordinator:
+    initial = load_initial(run.path, run.config) if loaded is None else {}
+    with Coordinator(run, display, loaded, initial, inexact, callback) as coordinator:
         coordinator.run()
     return True
 

@@ -138,12 +138,14 @@ def write_job(
     chosen: Sequence[int],
     start: int,
     replay: bool,
+    is_restored: bool,
 ) -> dict[str, Any]:
     """Writes the header of the message that starts a worker; a checkpoint's arrays go beside it.
 
     Args:
       chosen: the indices of the worker's members among those of `run`.
       start, replay: see `Job`.
+      is_restored: whether the arrays are those of this run, or what it starts from.
     """
     return {
         **to_stored(run),
@@ -151,6 +153,7 @@ def write_job(
         "members": list(chosen),
         "start": start,
         "replay": replay,
+        "is_restored": is_restored,
     }
 
 
@@ -159,7 +162,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
     prepared = Prepared(read_stored(header), read_spaces(header["spaces"]), None)
     return prepared.job(
         header["members"],
-        restored=arrays or None,
+        **{"restored" if header["is_restored"] else "initial": arrays or None},
         start=header["start"],
         replay=header["replay"],
     )

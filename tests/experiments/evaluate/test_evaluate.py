@@ -13,12 +13,12 @@ import worlds
 from helpers import SMALL
 from sauna import cli
 from sauna.experiments.evaluate import episodes, play
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.episodes import VideoFailure, kwargs_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frame, frames_per_second, video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.training.artifact import load_artifact
 
 SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 96}
 

@@ -14,18 +14,18 @@ from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.artifact import (
+from sauna.experiments.evaluate.play import Progress
+from sauna.experiments.evaluate.video import record_video
+from sauna.system import run_directory
+from sauna.system.errors import BadInput, SaunaError
+from sauna.system.working_folder import kept_folder
+from sauna.training.artifact import (
     Artifact,
     best_steps,
     check_spaces,
     find_member,
     load_artifact,
 )
-from sauna.experiments.evaluate.play import Progress
-from sauna.experiments.evaluate.video import record_video
-from sauna.system import run_directory
-from sauna.system.errors import BadInput, SaunaError
-from sauna.system.working_folder import kept_folder
 
 if TYPE_CHECKING:
     from sauna.algorithm.rollout.play import Episode

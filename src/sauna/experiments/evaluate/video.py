@@ -15,9 +15,9 @@ import numpy as np
 
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_drawn_env
-from sauna.experiments.evaluate.artifact import Artifact
 from sauna.system.errors import SaunaError, one_line
 from sauna.system.safe_write import own_folder, replacing
+from sauna.training.artifact import Artifact
 
 
 def record_video(

@@ -39,6 +39,11 @@ from sauna.training.loop.device_program import (
     make_mesh,
 )
 from sauna.training.loop.evaluation import DevicePlayer, Evaluator, Frozen, stop_named
+from sauna.training.loop.fine_tuning import (
+    as_long_moments,
+    initial_moments,
+    initial_params,
+)
 from sauna.training.loop.job import Job, Reporter, Setting, check_finite
 from sauna.training.loop.member_state import (
     Counters,
@@ -89,6 +94,8 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     restored = broadcast_arrays(host, dict(job.restored or {}))
     if restored:
         counters = _restore(job, population, restored)
+    elif job.initial:
+        _initialise(job, population, job.initial)
     evaluator = make_evaluator(job, population)
     reporter.phase("compiling")
     reporter.phase(f"compiled in {population.compile():.1f} s")
@@ -186,7 +193,7 @@ def _report(
     number = int(ran.any(0).sum())
     for i in range(number):
         rows, steps = [], 0
-        for p in np.flatnonzero(ran[:, i]):
+        for p in np.flatnonzero(ran[:, i]).tolist():
             report = jax.tree.map(lambda x: x[i], reports[p])  # noqa: B023
             member = job.members[p]
             _check_sound(member, first + i, report)
@@ -311,6 +318,25 @@ def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
             array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))
         found.append(array)
     return jax.tree_util.tree_unflatten(structure, found)
+
+
+def _initialise(job: Job, population: Population, arrays: Mapping[str, np.ndarray]) -> None:
+    """Starts all members from trained ones."""
+    states = []
+    for member, fresh in zip(job.members, population.states(), strict=True):
+        own = under(member.name + "/", arrays)
+        params = initial_params(population.policy, fresh.learner.params, own)
+        collect = fresh.collect
+        for kind in ("observation_moments", "reward_moments"):
+            example = getattr(collect, kind)
+            if not isinstance(example, LongMoments):
+                continue
+            if (found := initial_moments(kind, own, example.mean.shape)) is not None:
+                collect = collect._replace(**{kind: as_long_moments(found, example)})
+        states.append(
+            fresh._replace(learner=fresh.learner._replace(params=params), collect=collect)
+        )
+    population.restore(states)
 
 
 def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray]) -> list[Counters]:

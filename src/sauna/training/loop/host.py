@@ -27,8 +27,15 @@ from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
 from sauna.training.loop.budget import budget_left, hypers_now, step_limit
 from sauna.training.loop.evaluation import Evaluator, Frozen, HostPlayer, stop_named
+from sauna.training.loop.fine_tuning import initial_moments, initial_params
 from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
-from sauna.training.loop.member_state import Counters, pack_member, unpack_member
+from sauna.training.loop.member_state import (
+    Counters,
+    moments_of,
+    pack_member,
+    under,
+    unpack_member,
+)
 from sauna.training.loop.metrics import metrics_row
 
 
@@ -67,7 +74,7 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
             collect_seconds = time.perf_counter() - clock
             collect_cpu = time.process_time() - cpu
             rows, update_cpu = [], {}
-            for p in np.flatnonzero(limit):
+            for p in np.flatnonzero(limit).tolist():
                 cpu = time.process_time()
                 order = minibatch_order(config, members[p].seed, iteration)
                 states[p], learned = _learn(
@@ -138,7 +145,24 @@ def _start(
             states[p], counters[p] = unpack_member(
                 member.name, p, job.restored, states[p], program.policy, collector, envs, job.replay
             )
+    elif job.initial:
+        for p, member in enumerate(job.members):
+            own = under(f"{member.name}/", job.initial)
+            params = initial_params(program.policy, states[p].params, own)
+            states[p] = states[p]._replace(params=params)
+            _keep_moments(collector, p, own)
     return states, counters
+
+
+def _keep_moments(collector: HostCollector, p: int, own: Arrays) -> None:
+    """Lets member `p` go on with the running moments that it starts from."""
+    views = moments_of(collector, p)
+    for kind in ("observation_moments", "reward_moments"):
+        if f"{kind}/mean" not in views:
+            continue
+        found = initial_moments(kind, own, views[f"{kind}/mean"].shape)
+        for name, value in (found._asdict() if found else {}).items():
+            views[f"{kind}/{name}"][...] = value
 
 
 def _learn(

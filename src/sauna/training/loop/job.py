@@ -48,6 +48,7 @@ class Job(NamedTuple):
     env_kwargs: dict[str, Any]
     members: list[Member]
     restored: Mapping[str, np.ndarray] | None = None  # a checkpoint's arrays; None: start afresh
+    initial: Mapping[str, np.ndarray] | None = None  # of trained members, to start afresh from
     start: int = 0  # the first iteration to run
     replay: bool = True  # whether environments can be brought back by replaying
 
