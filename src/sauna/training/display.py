@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.training.summary import with_evaluation
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
 
@@ -56,11 +57,11 @@ class _Progress:
         self.rate: float | None = None
         self._first: tuple[float, int] | None = None
         for row in rows:
-            self.latest[row["member"]] = row
+            self.latest[row["member"]] = with_evaluation(row, self.latest[row["member"]])
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
         for row in rows:
-            self.latest[row["member"]] = row
+            self.latest[row["member"]] = with_evaluation(row, self.latest[row["member"]])
         done, now = sum(map(self.budget_used, self.latest)), time.monotonic()
         if self._first is None:
             if all(self.latest.values()):
@@ -140,7 +141,7 @@ class PlainDisplay:
             self.say(
                 f"{name}: return {number(row, 'return_mean', '.2f')} "
                 f"(training, last 100 episodes), {row['env_steps']:,} env steps, "
-                f"{row['kept_steps']:,} kept"
+                f"{row['kept_steps']:,} kept{evaluated(row)}"
             )
 
     def close(self) -> None:
@@ -200,11 +201,27 @@ class LiveDisplay:
         self.refresh()
         self.close()
         self.say("return: mean training return of the last 100 episodes")
+        for name, row in members.items():
+            if text := evaluated(row):
+                self.say(f"{name}{text}")
 
     def close(self) -> None:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+def evaluated(row: dict[str, Any]) -> str:
+    """Says what a member's evaluations came to, and whether it was stopped early."""
+    text = ""
+    if "eval_return_mean" in row:
+        text = (
+            f"; evaluation: return {row['eval_return_mean']:.2f}, best "
+            f"{row['eval_return_best']:.2f}, {row['eval_env_steps']:,} env steps of its own"
+        )
+    if "stopped_early" in row:
+        text += f"; stopped early ({row['stopped_early']})"
+    return text
 
 
 def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
@@ -222,6 +239,8 @@ def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
         ("expl. var.", "explained_variance", ".2f"),
     ]
     configs = [member.config for member in members]
+    if any(config.eval_every for config in configs):
+        columns.insert(3, ("evaluation", "eval_return_mean", ".1f"))
     if any(config.filter != "none" for config in configs):
         columns.append(("keep rate", "keep_rate", ".3f"))
     if any(config.sampler != "none" for config in configs):

@@ -24,6 +24,12 @@ KEPT = (
 )
 
 
+def with_evaluation(row: Mapping[str, Any], before: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A member's newest row with the numbers of its last evaluation, which `before` has."""
+    kept = {name: value for name, value in (before or {}).items() if name.startswith("eval_")}
+    return {**kept, **row}
+
+
 def summarize(
     rows: Iterable[Mapping[str, Any]], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, dict[str, Any]]:
@@ -34,9 +40,7 @@ def summarize(
     """
     last: dict[str, dict[str, Any]] = {}
     for row in rows:
-        before = last.get(row["member"], {})
-        evaluated = {name: value for name, value in before.items() if name.startswith("eval_")}
-        last[row["member"]] = {**evaluated, **row}
+        last[row["member"]] = with_evaluation(row, last.get(row["member"]))
     found = {name: {key: row[key] for key in KEPT if key in row} for name, row in last.items()}
     for name, row in found.items():
         if stopped := int(arrays.get(f"{name}/counters/stopped", 0)):

@@ -326,13 +326,14 @@ def _initialise(job: Job, population: Population, arrays: Mapping[str, np.ndarra
     for member, fresh in zip(job.members, population.states(), strict=True):
         own = under(member.name + "/", arrays)
         params = initial_params(population.policy, fresh.learner.params, own)
-        collect = fresh.collect
+        kept: dict[str, Any] = {}
         for kind in ("observation_moments", "reward_moments"):
-            example = getattr(collect, kind)
+            example = getattr(fresh.collect, kind)
             if not isinstance(example, LongMoments):
                 continue
             if (found := initial_moments(kind, own, example.mean.shape)) is not None:
-                collect = collect._replace(**{kind: as_long_moments(found, example)})
+                kept[kind] = as_long_moments(found, example)
+        collect = fresh.collect._replace(**kept)
         states.append(
             fresh._replace(learner=fresh.learner._replace(params=params), collect=collect)
         )
