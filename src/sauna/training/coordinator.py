@@ -296,6 +296,8 @@ class Coordinator:
                 for t in timings
                 for member, seconds in t["update_cpu_seconds"].items()
             }
+        if any("evaluation_seconds" in timing for timing in timings):
+            timing["evaluation_seconds"] = max(t.get("evaluation_seconds", 0.0) for t in timings)
         for warning in self._empty_updates.see(rows):
             self._display.say(warning)
         self._logs.append("metrics.jsonl", rows)

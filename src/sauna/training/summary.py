@@ -43,6 +43,7 @@ def summarize(
         last[row["member"]] = with_evaluation(row, last.get(row["member"]))
     found = {name: {key: row[key] for key in KEPT if key in row} for name, row in last.items()}
     for name, row in found.items():
-        if stopped := int(arrays.get(f"{name}/counters/stopped", 0)):
-            row["stopped_early"] = STOPS[stopped]
+        stopped = arrays.get(f"{name}/counters/stopped", 0)
+        if reason := dict(enumerate(STOPS)).get(int(stopped)):
+            row["stopped_early"] = reason
     return found

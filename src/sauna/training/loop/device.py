@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -111,7 +111,7 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
         clock = time.perf_counter()
         reports = population.run(iteration, number)
         seconds = time.perf_counter() - clock
-        watch = partial(_evaluate, evaluator, population)
+        watch = evaluator, population
         iteration = _report(job, reporter, iteration, reports, counters, seconds, watch)
         if iteration % config.checkpoint_every == 0:
             reporter.state(iteration, pack(job, population, counters) | evaluator.to_arrays())
@@ -124,16 +124,10 @@ def make_evaluator(job: Job, population: Population) -> Evaluator:
     return Evaluator(job, population.policy, player)
 
 
-def _evaluate(
-    evaluator: Evaluator, population: Population, p: int, counters: Counters, steps_before: int
-) -> dict[str, Any]:
-    """Evaluates member `p` at the end of a call, if that is due."""
-
-    def frozen() -> Frozen:
-        state = population.states()[p]
-        return Frozen(np.asarray(state.learner.params), _moments(state))
-
-    return evaluator.after(p, counters, steps_before, frozen)
+def _frozen(population: Population, p: int) -> Frozen:
+    """What member `p` acts with now."""
+    state = population.states()[p]
+    return Frozen(np.asarray(state.learner.params), _moments(state))
 
 
 def _settings(job: Job) -> str:
@@ -182,17 +176,19 @@ def _report(
     reports: list[Report],
     counters: list[Counters],
     seconds: float,
-    watch: Callable[[int, Counters, int], dict[str, Any]],
+    watch: tuple[Evaluator, Population],
 ) -> int:
     """Reports what one call ran; the iteration that comes next.
 
     Args:
-      watch: evaluates a member after an iteration, if that is due: then it is the call's last.
+      watch: what evaluates a member if that is due (then the iteration is the call's last), and
+        who they are.
     """
+    evaluator, population = watch
     ran = np.stack([report.ran for report in reports])  # [P, MAX_PER_CALL]
     number = int(ran.any(0).sum())
     for i in range(number):
-        rows, steps = [], 0
+        rows, steps, evaluated = [], 0, evaluator.seconds
         for p in np.flatnonzero(ran[:, i]).tolist():
             report = jax.tree.map(lambda x: x[i], reports[p])  # noqa: B023
             member = job.members[p]
@@ -202,8 +198,11 @@ def _report(
             counters[p].add(collected)
             steps += collected.env_steps
             row = _row(member, job.config, first + i, collected, counters[p], report)
-            rows.append(row | watch(p, counters[p], before))
+            frozen = partial(_frozen, population, p)
+            rows.append(row | evaluator.after(p, counters[p], before, frozen))
         timing = {"env_steps": steps, "seconds": seconds / number}
+        if evaluating := evaluator.seconds - evaluated:
+            timing["evaluation_seconds"] = evaluating
         reporter.iteration(first + i, rows, timing)
     return first + number
 

@@ -31,7 +31,7 @@ from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.make import make_env
 from sauna.system.errors import one_line
 from sauna.training.loop.job import Arrays, Job
-from sauna.training.loop.member_state import Counters, named_params, under
+from sauna.training.loop.member_state import Counters, fitting, named_params, under
 from sauna.training.summary import STOPS
 
 ENV_INDEX = 2**31  # of an evaluation's episodes: no environment of training has it
@@ -99,9 +99,25 @@ class Evaluated:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Evaluated:
-        """The inverse of `to_arrays`."""
-        stored = {name: array.item() for name, array in under("evaluation/", arrays).items()}
-        return cls(**stored, best_policy=under("best/", arrays)) if stored else cls()
+        """The inverse of `to_arrays`.
+
+        Raises:
+          BadCheckpoint: a number is missing, or of another shape or type.
+        """
+        if not (best_policy := under("best/", arrays)):
+            return cls()
+        number = partial(_number, arrays)
+        return cls(
+            number("env_steps", np.int64),
+            number("best", np.float64),
+            number("best_env_steps", np.int64),
+            number("since_best", np.int64),
+            best_policy,
+        )
+
+
+def _number(arrays: Mapping[str, np.ndarray], name: str, dtype: Any) -> Any:
+    return fitting(arrays, f"evaluation/{name}", np.zeros((), dtype)).item()
 
 
 class Evaluator:
