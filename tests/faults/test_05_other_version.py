@@ -35,6 +35,8 @@ OTHERS = {
     "gamma": 0.5,
     "gae_lambda": 0.5,
     "drop_rate": 0.25,
+    "stop_at": 2.0,
+    "init_from": "runs/another",
 }
 
 
