@@ -52,8 +52,10 @@ def config_of(settings: dict[str, Any], spaces: Spaces, **rule: Any) -> Config:
     return dataclasses.replace(config, network=network)
 
 
-def one_update(config: Config, spaces: Spaces) -> Callable[[], float]:
-    """A function that runs one update on random samples and returns its CPU seconds."""
+def one_update(
+    config: Config, spaces: Spaces, clock_of: Callable[[], float]
+) -> Callable[[], float]:
+    """A function that runs one update on random samples and returns its seconds by a clock."""
     learner = make_learner(config, make_policy(config, spaces), spaces)
     rng, shape = np.random.default_rng(0), (config.rollout_steps, config.envs)
     keys = member_keys(0)
@@ -78,25 +80,27 @@ def one_update(config: Config, spaces: Spaces) -> Callable[[], float]:
 
     def call() -> float:
         nonlocal state
-        clock = time.process_time()
+        clock = clock_of()
         state, metrics = learner.learn(state, rollout, batch, hypers, order, key)
         jax.block_until_ready(metrics)
-        return time.process_time() - clock
+        return clock_of() - clock
 
     call()
     return call
 
 
-def measure(name: str, rounds: int) -> dict[str, Any]:
+def measure(
+    name: str, rounds: int, clock_of: Callable[[], float] = time.process_time
+) -> dict[str, Any]:
     settings, spaces = CASES[name]
-    calls = {"ppo": one_update(config_of(settings, spaces), spaces)}
+    calls = {"ppo": one_update(config_of(settings, spaces), spaces, clock_of)}
     for share in SHARES:
         rule = {
             "sampler": "top-advantage",
             "sampler_kwargs": {"share": share},
             "normalize_over": "rollout",
         }
-        calls[str(share)] = one_update(config_of(settings, spaces, **rule), spaces)
+        calls[str(share)] = one_update(config_of(settings, spaces, **rule), spaces, clock_of)
     seconds: dict[str, list[float]] = {label: [] for label in calls}
     for _ in range(rounds):
         for label, call in calls.items():
@@ -116,16 +120,18 @@ def measure(name: str, rounds: int) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--only", default="")
-    rounds = parser.parse_args().rounds
-    only = parser.parse_args().only
-    result: dict[str, Any] = {"command": f"python benchmarks/selection.py --rounds {rounds}"}
-    for name in CASES:
-        if only in name:
-            result[name] = measure(name, rounds)
-            print(name, json.dumps(result[name]), flush=True)
-    if not only:
-        PATH.write_text(json.dumps(result, indent=1) + "\n")
+    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--wall", action="store_true", help="time by the wall, as on a GPU")
+    parser.add_argument("--out", type=Path, help=f"default: {PATH.name}, if every case is timed")
+    options = parser.parse_args()
+    clock_of = time.perf_counter if options.wall else time.process_time
+    command = f"python benchmarks/selection.py --rounds {options.rounds}"
+    result: dict[str, Any] = {"command": command + " --wall" * options.wall}
+    for name in (name for name in CASES if options.only in name):
+        result[name] = measure(name, options.rounds, clock_of)
+        print(name, json.dumps(result[name]), flush=True)
+    if path := options.out or (None if options.only else PATH):
+        path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
