@@ -72,6 +72,8 @@ def plot(paths: Sequence[Path], out: str = "", tag: str = "") -> Path:
     path = Path(out or "learning_curves.png")
     if not out and len(paths) == 1 and (paths[0] / "config.json").is_file():
         path = paths[0] / "figures" / "learning_curve.png"
+        if drawn := draw_curve(paths[0]):
+            return drawn
     if path.suffix not in (".png", ".svg"):
         raise BadInput(f"out: {path} must end in .png or .svg")
     return draw_sources(read_sources(paths, tag), path)
