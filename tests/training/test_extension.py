@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, Ended, go, played_back, record, trained_here
+from faults.canned import BACKENDS, Ended, Trap, go, played_back, record, trained_here
+from faults.disk import Crash, watched
 from helpers import SMALL, configured
 from sauna.system import checkpoint, run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
 from sauna.training.display import PlainDisplay
 from sauna.training.loop.budget import device_hypers, hypers_now
@@ -140,3 +142,29 @@ def test_a_run_that_goes_further_lets_stopped_members_go_on(changed: dict[str, A
     assert "ppo/0/counters/stopped" not in found
     assert found["ppo/0/evaluation/since_best"] == 0
     np.testing.assert_array_equal(found["ppo/0/params/x"], np.ones(2))
+
+
+def test_killed_while_it_is_extended_a_run_is_the_old_one_or_the_new_one(
+    finished, tmp_path
+) -> None:
+    """Whatever was written by then: the same command, or a plain resume, goes on from there."""
+    rows = (finished / "metrics.jsonl").read_bytes()
+    again = {"steps": 384, "quiet": True}
+    with played_back(record()):
+        whole = shutil.copytree(finished, tmp_path / "whole")
+        trap = Trap()
+        with watched(whole, trap):
+            sauna.resume(whole, **again)
+        assert len(trap.ops) > 4
+        for at in range(len(trap.ops)):
+            run = shutil.copytree(finished, tmp_path / f"killed-{at}")
+            with pytest.raises((Crash, SaunaError)), watched(run, Trap(at)):
+                sauna.resume(run, **again)
+            stored = run_directory.read_config(run)
+            assert stored["config"]["steps"] in (192, 384)
+            assert ("extended" in stored) == (stored["config"]["steps"] == 384)
+            sauna.resume(run, quiet=True)
+            sauna.resume(run, **again)
+            assert run_directory.is_complete(run)
+            assert run_directory.read_config(run)["config"]["steps"] == 384
+            assert (run / "metrics.jsonl").read_bytes() == rows
