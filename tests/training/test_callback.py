@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import SAVED, SETTINGS, WORLD, Ended, go, played_back, record, trained_here
+from faults.canned import SAVED, SETTINGS, WORLD, Ended, go, played_back, record
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.training.summary import STOPS
+from threads import trained_here
 
 
 class OfUser(Exception):

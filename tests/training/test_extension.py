@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, Ended, Trap, go, played_back, record, trained_here
+from faults.canned import BACKENDS, Ended, Trap, go, played_back, record
 from faults.disk import Crash, watched
 from helpers import SMALL, configured
 from sauna.system import checkpoint, run_directory
@@ -22,6 +22,7 @@ from sauna.training.loop.budget import device_hypers, hypers_now
 from sauna.training.loop.job import Setting
 from sauna.training.loop.member_state import Counters
 from sauna.training.train import going_on
+from threads import trained_here
 
 WATCHED = {"eval_every": 64, "eval_episodes": 2}
 KEPT = {"checkpoint_every": 2, "keep_checkpoints": 99}

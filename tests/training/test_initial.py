@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, trained_here
+from faults.canned import BACKENDS
 from helpers import SMALL, equal, make_job, train_here
 from sauna.config.presets import Member
 from sauna.config.settings import Config
@@ -19,6 +19,7 @@ from sauna.system.errors import BadInput
 from sauna.training.initial import Source, _reward_moments, _source_of, read_initial
 from sauna.training.loop.member_state import under
 from sauna.training.prepare import prepare
+from threads import trained_here
 
 SETTINGS: dict[str, Any] = {**SMALL, "arm": "ppo", "processes": 1, "seeds": 2}
 

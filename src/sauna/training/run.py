@@ -19,6 +19,7 @@ from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
 from sauna.config.stored import read_stored, to_stored
 from sauna.config.trust import check_trusted, seal
+from sauna.envs.probe import Probe
 from sauna.envs.spaces import Spaces, difference, read_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -91,10 +92,18 @@ class Run:
         }
 
 
-def start(overrides: Mapping[str, Any], display: Display, trust: bool = False) -> Run:
+def start(
+    overrides: Mapping[str, Any],
+    display: Display,
+    found: Probe | None = None,
+    trust: bool = False,
+) -> Run:
     """Starts a new run: everything is checked before anything is created.
 
     Args:
+      overrides: the settings that a user gives.
+      display: what is said goes there.
+      found: what is known of the environment already.
       trust: the code that the run of `init_from` names may be another user's.
 
     Raises:
@@ -104,7 +113,7 @@ def start(overrides: Mapping[str, Any], display: Display, trust: bool = False) -
         overrides = plain(overrides)
         placed = place(resolve_run(overrides))
         check_writes(placed.config)
-        prepared = examine(placed, overrides)
+        prepared = examine(placed, overrides, found)
         TensorBoard.check(prepared.config)
         check_own_parts(prepared)
         initial = read_initial(prepared, display.say, trust)
