@@ -97,6 +97,20 @@ def test_each_field_has_its_own_schedule_on_the_host_and_on_the_device(schedule:
             np.testing.assert_allclose(factor, shaped(1.0, schedule, 1 - used / STEPS), 1e-5)
 
 
+@pytest.mark.parametrize("settings", [{"learning_rate_schedule": "cosine"}, {"warmup": 0.05}])
+def test_restarted_schedules_are_those_of_the_budget_behind_their_start(settings: dict) -> None:
+    """Of 10,000 steps behind 5,000, as of 10,000 steps; before them, as at their beginning."""
+    whole = dataclasses.replace(small(**settings), steps=STEPS + 5_000, schedule_start=5_000)
+    first = Hypers(*[jnp.float32(getattr(whole, field)) for field in Hypers._fields])
+    setting = Setting(None, first, jnp.int32(whole.steps))  # type: ignore[arg-type] # no key is read
+    for used in USED:
+        expected = now(small(**settings), used)
+        assert now(whole, used + 5_000) == expected
+        there = device_hypers(whole, setting, jnp.int32(used + 5_000))
+        np.testing.assert_allclose(np.array(there), np.array(expected), 1e-4, 3 * ROUNDING)
+    assert now(whole, 4_000) == now(whole, 5_000)
+
+
 def test_a_warm_up_is_the_same_on_the_device() -> None:
     config = small(warmup=0.05)
     first = Hypers(*[jnp.float32(getattr(config, field)) for field in Hypers._fields])

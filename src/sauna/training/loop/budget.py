@@ -14,7 +14,12 @@ from sauna.training.loop.schedules import scheduled
 
 
 def budget_left(config: Config, counters: Counters) -> bool:
-    """Returns whether a whole rollout still fits in the budget: a run never oversteps it."""
+    """Returns whether a whole rollout still fits in the budget: a run never oversteps it.
+
+    A member that was stopped early has none left.
+    """
+    if counters.stopped:
+        return False
     used = counters.kept_steps if config.budget == "kept" else counters.env_steps
     return config.steps - used >= config.rollout_steps * config.envs
 

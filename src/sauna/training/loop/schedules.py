@@ -21,11 +21,15 @@ def scheduled(
 ) -> dict[str, Any]:
     """Computes the hyperparameters that have a schedule, of one iteration.
 
+    Schedules cover the budget behind `schedule_start`; before it they are at their beginning.
+
     Args:
       first: their values before their schedules.
       used: how many of the budget's `steps` are used; numbers, or arrays `[]` on the device.
       coming: steps of the budget that one rollout takes; at the end of it counts the warm-up.
     """
+    if start := config.schedule_start:
+        used, steps = used - least(used, start), steps - start
     left = 1.0 - used / steps
     found = {}
     for name in SCHEDULED:
