@@ -20,14 +20,8 @@ from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint
 from sauna.config.parsing import whole_number
 from sauna.config.presets import (
-    ARM_HELP,
     COMPARED,
     COMPARED_SEEDS,
-    CONTROL_HELP,
-    FILTER_HELP,
-    PRESET_HELP,
-    RULE_HELP,
-    TARGET_HELP,
     overrides_of,
     parse_all,
 )
@@ -245,25 +239,29 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.api import train_and_draw
     from sauna.training import run as runs
     from sauna.training.display import make_display
+    from sauna.training.pick import pick
 
     stored = _overrides_in(values.pop("config"), values.pop("trust"))
     env = values.pop("env")
-    overrides = _over(stored, values | ({"env": env} if env else {}))
+    picked = pick(_over(stored, values | ({"env": env} if env else {})))
+    overrides = translate(picked.overrides)
     display = make_display()
     if runs.follows(overrides):
         runs.follow(overrides, display)
         return
-    run = runs.start(overrides, display)
+    run = runs.start(overrides, display, picked.found)
+    if picked.said:
+        display.say(picked.said)
     train_and_draw(run, display, resume=False)
     curve = run.path / "figures" / "learning_curve.png"
     print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
-    """Puts what is typed over what a file says; `--seed` and `--batch-size` count as typed."""
+    """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
     replaced = {"seed": "seeds", "batch_size": "minibatches"}
     gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
-    return translate({k: v for k, v in stored.items() if k not in gone} | typed)
+    return {k: v for k, v in stored.items() if k not in gone} | typed
 
 
 def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
@@ -341,7 +339,8 @@ def _compare(values: dict[str, Any]) -> None:
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
-    values = translate(values)
+    values = translate({"env": env, **values})
+    del values["env"]
     parsed = parse_all(values)
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(env, chosen, parsed, is_tournament)
@@ -393,46 +392,10 @@ def _say(text: str) -> None:
 
 
 def _list(values: dict[str, Any]) -> None:
-    what = values["what"]
-    if what == "envs":
-        import gymnasium
+    from sauna.experiments.listing import listing
 
-        import sauna.envs.flagrun  # noqa: F401 - registers it
-
-        for name in sorted(gymnasium.registry):
-            print(name)
-        for backend in NATIVE:
-            print(f"{backend}/...  (on the device; `sauna list {backend}` names them)")
-        print("ALE/...  (`sauna list atari` names them)")
-    elif what == "atari":
-        from sauna.envs.host.atari_envs import names
-
-        print("\n".join(names()))
-    elif what in NATIVE:
-        from sauna.envs.device.make import names_of
-
-        for name in names_of(what):
-            print(name)
-    elif what == "rules":
-        for name, text in {**RULE_HELP, **CONTROL_HELP}.items():
-            stage, _, sentence = text.partition(": ")
-            print(f"{name:15} {stage:8} {sentence}")
-        print("\nJoin rules by +, such as sauna+avec, and a control to a rule: gigaflow+random")
-    elif what == "studies":
-        from sauna.experiments.study.spec import built_in
-
-        for name, text in built_in().items():
-            print(f"{name:10} {text.splitlines()[0].removeprefix('# ')}")
-    else:
-        known = {
-            "arms": ARM_HELP,
-            "presets": PRESET_HELP,
-            "filters": FILTER_HELP,
-            "targets": TARGET_HELP,
-        }[what]
-        width = max(map(len, known))
-        for name, text in known.items():
-            print(f"{name:{width}}  {text}")
+    for line in listing(values["what"]):
+        print(line)
 
 
 _COMMANDS = {
