@@ -223,7 +223,7 @@ def _train(
         _note(spec, place, size)
         say = _silent if quiet else partial(print, flush=True)
         units = every_unit(spec, size)
-        check_same_code(units, folder, accept_changed_code)
+        check_same_code(units, folder, accept_changed_code, say)
         reopen_damaged(units, folder, say)
         say(_opening(spec, place))
         for note in before_training(spec):
