@@ -40,7 +40,7 @@ BAD = [
     (["train", WORLD, "--gamma", "1.1"], "gamma: must be at most 1"),
     (["train", WORLD, "--gamma", "nan"], "gamma: must be a finite number"),
     (["train", WORLD, "--hidden", ""], "hidden: cannot read"),
-    (["train", WORLD, "--env-kwargs", "[1]"], "env_kwargs: cannot read"),
+    (["train", WORLD, "--env-kwargs", "[1]"], "env_kwargs: '[1]' is no JSON object, such as"),
     (["train", WORLD, "--env-kwargs", '{"a": [0, Infinity]}'], "JSON has no infinity and no NaN"),
     (["train", WORLD, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
     (["train", WORLD, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
