@@ -114,3 +114,4 @@ def assert_same_step(one: Step, two: Step) -> None:
     for a, b in zip(one[:4], two[:4], strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])
+    assert one.info == two.info

@@ -17,6 +17,7 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.training import run as runs
 from sauna.training.display import Display, PlainDisplay, make_display
+from sauna.training.pick import pick
 from sauna.training.train import train_run
 
 PARTS = fields_with("plugin")  # what a user may pass by value
@@ -82,11 +83,15 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
       BadInput: a setting is not usable; nothing was created.
       SaunaError: training failed; the last good checkpoint is on disk.
     """
-    overrides = translate({"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}})
-    if overrides.get("out") is not None:
-        overrides["out"] = str(overrides["out"])
+    given = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
+    if given.get("out") is not None:
+        given["out"] = str(given["out"])
+    picked = pick(given)
+    overrides = translate(picked.overrides)
     display: Display = _Silent() if quiet else make_display()
-    run = runs.start(overrides, display)
+    run = runs.start(overrides, display, picked.found)
+    if picked.said:
+        display.say(picked.said)
     train_and_draw(run, display, resume=False)
     return Result(run.path)
 
@@ -145,8 +150,8 @@ def compare(
     for name in PARTS:
         if is_local(str(overrides.get(name))):
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
-    task = overrides.pop("env")
     overrides = translate(overrides)
+    task = overrides.pop("env")
     arms, parsed = (arms,) if isinstance(arms, str) else tuple(arms), parse_all(overrides)
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(task, chosen, parsed, is_tournament)

@@ -336,7 +336,8 @@ def test_bad_input_creates_nothing(run, tmp_path) -> None:
 @pytest.mark.slow
 def test_runs_of_the_device_and_of_pictures_are_inspected(tmp_path) -> None:
     for env, more in (("gymnax/CartPole-v1", {}), ("worlds:Picture", {"network": "nature-cnn"})):
-        settings = {**SMALL, "arm": "sauna", "out": tmp_path / env.replace("/", "-"), **more}
+        settings = {**SMALL, "preset": "mujoco", "arm": "sauna", **more}
+        settings["out"] = tmp_path / env.replace("/", "-")
         if more:
             del settings["hidden"]
         path = sauna.train(env, quiet=True, **settings).path

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, WORLD, Trap, played_back, record, trained_here, until
+from faults.canned import BACKENDS, WORLD, Trap, played_back, record, until
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
@@ -25,6 +25,7 @@ from sauna.experiments.evaluate.episodes import evaluate
 from sauna.experiments.inspect.inspection import examine
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
+from threads import trained_here
 
 # A value of the same type that is another one, where adding 1 would not be.
 OTHERS = {
@@ -183,8 +184,8 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     assert (
         sauna.load(run, trust=True)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
     )
-    with trained_here():
-        sauna.resume(run, trust=True)
+    with trained_here():  # our worlds may have changed since
+        sauna.resume(run, trust=True, accept_changed_code=True)
     assert run_directory.is_complete(run)
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
     rows, old = (run / "metrics.jsonl").read_bytes(), (golden / "metrics.jsonl").read_bytes()

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import trained_here
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
 from jax_worlds import FIELDS, Poison, poisoned
@@ -40,6 +39,7 @@ from sauna.training.loop.device_program import (
     make_iteration,
     several,
 )
+from threads import trained_here
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 VALUES = ("nan", "inf", "-inf")

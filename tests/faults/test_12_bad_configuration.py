@@ -145,7 +145,7 @@ def wrong_environment(rng: random.Random) -> Mistake:
             Mistake(["train", f"nowhere{rng.randrange(99)}:Thing"], "env: cannot import"),
             Mistake(["train", "worlds:Scriptd"], "did you mean 'Scripted'?"),
             Mistake(["train", WORLD, "--env-kwargs", '{"speed": 3}'], "cannot be made"),
-            Mistake(["train", WORLD, "--env-kwargs", "{speed: 3}"], "is no JSON object, such as"),
+            Mistake(["train", WORLD, "--env-kwargs", "{speed: 3}"], "env_kwargs: cannot read"),
             Mistake(["train", "os:system"], "'os' is a part of Python"),
             Mistake(["train"], "no environment given"),
         ]

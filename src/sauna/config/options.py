@@ -60,7 +60,12 @@ class Config:
         choices=("ppo", "a2c"),
         shapes_program=True,
     )
-    preset: str = _run("mujoco", "settings to start from; with A2C, preset a2c", common=True)
+    preset: str = _run(
+        "mujoco",
+        "settings to start from, see `sauna list presets`; auto: those of the environment, as "
+        "`train` takes if none is named (with A2C: a2c)",
+        common=True,
+    )
     seeds: tuple[int, ...] = _run(
         (0,),
         "how many seeds (6: seeds 0 to 5; 42: 42 of them), or which ones (100,101,110)",

@@ -33,6 +33,16 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+_KINDS: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "yes or no",
+    str: "text",
+    tuple[int, ...]: "whole numbers, separated by commas",
+    tuple[str, ...]: "names, separated by commas",
+}
+
+
 def parse(name: str, value: Any) -> Any:
     """Reads `value` (text of a command line, or a Python or JSON value) as field `name`'s type.
 
@@ -43,9 +53,8 @@ def parse(name: str, value: Any) -> Any:
     try:
         parsed = read_value(name, value, field_type)
     except (ValueError, TypeError, KeyError, OverflowError):
-        if name.endswith("_kwargs"):
-            raise BadInput(f"{name}: {value!r} is no JSON object, such as {EXAMPLE}") from None
-        expected = getattr(field_type, "__name__", str(field_type))
+        example = f"a JSON object, such as {EXAMPLE}"
+        expected = example if name.endswith("_kwargs") else _KINDS[field_type]
         raise BadInput(f"{name}: cannot read {value!r} as {expected}") from None
     named = meta["plugin"] and ":" in str(parsed)
     if isinstance(parsed, str) and meta["choices"] and parsed not in meta["choices"] and not named:

@@ -4,6 +4,7 @@ config.json     the settings and what each arm differs in, versions, git revisio
 failure.txt     the traceback of what ended it last, if something did
 metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
+metrics.csv     both as one table; see metrics_csv.py
 summary.json    how each member ended
 checkpoints/    see checkpoint.py
 figures/, videos/, tensorboard/

@@ -9,6 +9,7 @@ are shared over processes.
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Mapping
 from functools import partial
 from multiprocessing.connection import wait
@@ -22,6 +23,7 @@ from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.system.logs import Logs, check_logs
+from sauna.system.metrics_csv import MetricsCsv
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
 from sauna.system.safe_write import replace_file
 from sauna.system.signals import handled
@@ -29,6 +31,7 @@ from sauna.system.tracebacks import cause_of
 from sauna.system.watchdog import Watchdog
 from sauna.training.display import Display
 from sauna.training.empty_updates import EmptyUpdates
+from sauna.training.info_names import InfoNames
 from sauna.training.run import Run, resume_command
 from sauna.training.tensorboard import TensorBoard
 from sauna.training.worker import serve, write_job
@@ -55,13 +58,16 @@ class Coordinator:
         self._states: list[dict[int, dict[str, np.ndarray]]] = [{} for _ in self._parts]
         self._reached = [self._iteration] * len(self._parts)
         self._ended: list[int | None] = [None] * len(self._parts)
-        self._logs = Logs(run.path)
+        self._logs, self._csv = Logs(run.path), MetricsCsv(run.path)
+        self._clock = time.monotonic() - trained_seconds(run.path)
         self._due: list[tuple[int, dict[str, Any]]] = []  # checkpoints waiting for their states
         self._lead, self._granted = LEAD, 0
         self._signal: int | None = None
         self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
         self._empty_updates = EmptyUpdates()
+        self._before = run_directory.rows(run.path)  # of the run that is resumed
+        self._info_names = InfoNames(self._before)
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
@@ -113,7 +119,7 @@ class Coordinator:
           SaunaError: something failed; the last good checkpoint is on disk.
         """
         run = self._run
-        self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
+        self._display.open(run.config, run.members, run.path, self._before)
         with handled(self._on_signal):
             self._grant()
             while any(end is None for end in self._ended):
@@ -265,6 +271,7 @@ class Coordinator:
             "env_steps": steps,
             "seconds": seconds,
             "steps_per_second": steps / seconds,
+            "wall_seconds": round(time.monotonic() - self._clock, 3),
         }
         if all("collect_seconds" in timing for timing in timings):  # unknown on the device
             timing["collect_seconds"] = max(timing["collect_seconds"] for timing in timings)
@@ -274,13 +281,16 @@ class Coordinator:
                 for t in timings
                 for member, seconds in t["update_cpu_seconds"].items()
             }
-        for warning in self._empty_updates.see(rows):
+        warnings = [*self._empty_updates.see(rows), *map(self._info_names.admit, rows)]
+        for warning in filter(None, warnings):
             self._display.say(warning)
         self._logs.append("metrics.jsonl", rows)
         self._logs.append("timing.jsonl", [timing])
+        self._csv.append(rows, timing["wall_seconds"])
         self._tensorboard.write(rows, timing)
 
     def _write_summary(self, complete: bool) -> None:
+        self._csv.sync()
         check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
         last: dict[str, dict[str, Any]] = {}
         for row in run_directory.rows(self._run.path):
@@ -304,6 +314,14 @@ class Coordinator:
             {"complete": complete, "metric": text, "members": summary},
         )
         self._display.summary(summary)
+
+
+def trained_seconds(run: Path) -> float:
+    """Counts the seconds that a run has been trained for; of 0.1.0 those of its iterations."""
+    rows = run_directory.rows(run, "timing.jsonl")
+    if rows and "wall_seconds" in rows[-1]:
+        return float(rows[-1]["wall_seconds"])
+    return float(sum(row["seconds"] for row in rows))
 
 
 def lead_for(seconds: float) -> int:

@@ -54,13 +54,17 @@ class _Progress:
         self.phases: dict[int, str] = {}
         self.seconds_left: float | None = None
         self.rate: float | None = None
+        self.succeeds = False  # whether environments say if an episode was a success
         self._first: tuple[float, int] | None = None
+        self._take(rows)
+
+    def _take(self, rows: list[dict[str, Any]]) -> None:
         for row in rows:
             self.latest[row["member"]] = row
+            self.succeeds |= "success_rate" in row
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
-        for row in rows:
-            self.latest[row["member"]] = row
+        self._take(rows)
         done, now = sum(map(self.budget_used, self.latest)), time.monotonic()
         if self._first is None:
             if all(self.latest.values()):
@@ -189,7 +193,7 @@ class LiveDisplay:
         assert self._progress is not None
         table = Table(title=self._progress.status(), title_justify="left", box=None)
         table.add_column("member")
-        columns = columns_of(self._progress.members)
+        columns = columns_of(self._progress.members, self._progress.succeeds)
         for title, _, _ in columns:
             table.add_column(title, justify="right")
         for name, row in self._progress.latest.items():
@@ -207,10 +211,11 @@ class LiveDisplay:
             self._live = None
 
 
-def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
+def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str, str, str]]:
     """The live table's columns: title, key in a row, format.
 
-    What only a rule or a Vex head has is shown if a member has one.
+    What only a rule or a Vex head has is shown if a member has one; the rate of successes where
+    environments say so (`succeeds`).
     """
     columns = [
         ("env steps", "env_steps", ",d"),
@@ -221,6 +226,8 @@ def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
         ("KL", "kl", ".4f"),
         ("expl. var.", "explained_variance", ".2f"),
     ]
+    if succeeds:
+        columns.insert(3, ("success", "success_rate", ".0%"))
     configs = [member.config for member in members]
     if any(config.filter != "none" for config in configs):
         columns.append(("keep rate", "keep_rate", ".3f"))

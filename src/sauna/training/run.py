@@ -20,6 +20,7 @@ from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
 from sauna.config.stored import read_stored, to_stored
 from sauna.config.trust import check_trusted, seal
+from sauna.envs.probe import Probe
 from sauna.envs.spaces import Spaces, difference, read_spaces
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -82,8 +83,13 @@ class Run:
         }
 
 
-def start(overrides: Mapping[str, Any], display: Display) -> Run:
+def start(overrides: Mapping[str, Any], display: Display, found: Probe | None = None) -> Run:
     """Starts a new run: everything is checked before anything is created.
+
+    Args:
+      overrides: the settings that a user gives.
+      display: what is said goes there.
+      found: what is known of the environment already.
 
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
@@ -92,7 +98,7 @@ def start(overrides: Mapping[str, Any], display: Display) -> Run:
         overrides = plain(overrides)
         placed = place(resolve_run(overrides))
         check_writes(placed.config)
-        prepared = examine(placed, overrides)
+        prepared = examine(placed, overrides, found)
         TensorBoard.check(prepared.config)
         check_own_parts(prepared)
     path, made = _make_directory(prepared.config)

@@ -121,6 +121,10 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
     assert (dropped > 0.05) == (arm != "ppo"), "the filter had something to do"
 
 
+def same(value: Any) -> Any:
+    return value
+
+
 def _one(tree: Any, n: int) -> Any:
     return jax.tree.map(lambda x: x[n], tree)
 
@@ -128,12 +132,12 @@ def _one(tree: Any, n: int) -> Any:
 def test_an_ended_episode_keeps_its_last_observation_and_the_next_begins() -> None:
     env, key = flat(walk), jax.random.key(3)
     running = begin(env, key, 4, cached=False)
+    active = jnp.array([True, True, True, False])
+    step = jax.jit(lambda running: advance(env, running, jnp.ones((4, 1)), active, key, same))
     seen_ends = 0
     for _ in range(3 * LENGTH):
         before = running
-        running, transition = advance(
-            env, running, jnp.ones((4, 1)), jnp.array([True, True, True, False]), key, lambda x: x
-        )
+        running, transition = step(running)
         ended = np.asarray(transition.terminated | transition.truncated)
         for n in np.flatnonzero(ended):
             seen_ends += 1
@@ -147,13 +151,13 @@ def test_an_ended_episode_keeps_its_last_observation_and_the_next_begins() -> No
 
 def test_cached_resets_return_to_the_first_state_and_fresh_ones_do_not() -> None:
     env, key = flat(walk), jax.random.key(3)
+    everyone = jnp.ones(2, bool)
+    step = jax.jit(lambda running: advance(env, running, jnp.zeros((2, 1)), everyone, key, same))
     for cached in (True, False):
         running = first = begin(env, key, 2, cached=cached)
         starts = []
         for _ in range(3 * LENGTH):
-            running, transition = advance(
-                env, running, jnp.zeros((2, 1)), jnp.ones(2, bool), key, lambda x: x
-            )
+            running, transition = step(running)
             for n in np.flatnonzero(np.asarray(transition.terminated | transition.truncated)):
                 starts.append(bool((running.observation[n] == first.observation[n]).all()))
         assert starts and all(starts) == cached and any(starts) == cached

@@ -14,6 +14,7 @@ from sauna.experiments.report.curve import plot
 from sauna.experiments.report.sources import Curve, Source, read_scalars, read_sources
 from sauna.experiments.study.existing import compare_existing, results_of
 from sauna.system.errors import BadInput
+from sauna.system.metrics_csv import NAME, MetricsCsv
 
 
 def write_csv(path: Path, top: float, end: int, seeds: int = 4, head: str = "seed,step,return"):
@@ -58,6 +59,15 @@ def test_a_csv_file_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(source.seeds[3].y, [1.5, 3.5])
     others = write_csv(tmp_path / "other.csv", 1.0, 2000, head="seed,global_step,episodic_return")
     assert read_sources([others])[0].seeds[0].x.tolist() == [0, 1000, 2000]
+
+
+def test_the_table_of_a_run_gives_the_curves_of_the_run(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    MetricsCsv(run)
+    for of_run, of_table in zip(read_sources([run]), read_sources([run / NAME]), strict=True):
+        assert of_run.label == of_table.label and list(of_run.seeds) == list(of_table.seeds)
+        for seed in of_run.seeds:
+            np.testing.assert_array_equal(of_run.seeds[seed][:2], of_table.seeds[seed][:2])
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def comparison(
     rules = {}
     if "sauna-reference" in arms:  # beside it the others take its rules, so that the filter differs
         rules = {"truncation": "terminate", "budget": "env"}
-    algorithm = algorithm_of(chosen_preset(settings))
+    algorithm = algorithm_of(chosen_preset({**settings, "env": env}))
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
     entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
     seeds, design = COMPARED_SEEDS, {}

@@ -201,6 +201,7 @@ def _collected(report: Report) -> Collected:
         float(ends.return_mean),
         float(ends.length_mean),
         episodes,
+        {name: float(x) for name, x in sorted(ends.info.items()) if np.isfinite(x)},
     )
 
 
