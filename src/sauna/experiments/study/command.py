@@ -28,6 +28,7 @@ from sauna.experiments.study.execute.local import LocalExecutor
 from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
+from sauna.experiments.study.own_arms import check_no_rule, control_of_any, with_own_arms
 from sauna.experiments.study.results import gather, typed
 from sauna.experiments.study.rounds import every_unit, first_look, next_round, round_units, stopped
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
@@ -59,14 +60,17 @@ def chosen_arms(
       settings: of every run.
 
     Raises:
-      BadInput: both are given.
+      BadInput: both are given, or `settings` name a rule.
     """
     if rules and tuple(arms) != COMPARED:
         raise BadInput("rules: give --rules or --arms, not both")
     if tuple(arms) == ("all",):
         rules = tuple(RULE_HELP)
     chosen = ("ppo", *rules) if rules else tuple(arms)
-    return with_controls(chosen, settings) if controls else chosen, bool(rules)
+    check_no_rule(settings, chosen)
+    if controls:
+        chosen = with_controls(chosen, settings, control_of_any)
+    return chosen, bool(rules)
 
 
 def comparison(
@@ -76,7 +80,7 @@ def comparison(
 
     Args:
       env: the task.
-      arms: what is trained; the first is the baseline.
+      arms: what is trained, names or `module:name` of rules; the first is the baseline.
       settings: of every run.
       sequential: whether seeds are added only where something is open, `seeds` at most.
 
@@ -88,7 +92,8 @@ def comparison(
         rules = {"truncation": "terminate", "budget": "env"}
     algorithm = algorithm_of(chosen_preset({**settings, "env": env}))
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
-    entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
+    entries, settings = with_own_arms(arms, settings)
+    entries = [own if entry == {"label": "ppo"} else entry for entry in entries]
     seeds, design = COMPARED_SEEDS, {}
     if sequential:
         seeds, design = DESIGN[-1].seeds, {"design": "sequential"}
@@ -114,9 +119,9 @@ def compare_command(
     return f"sauna compare {shlex.quote(env)} {chosen}{flags}{_typed_out(out)}"
 
 
-def study_command(name: str, out: str | Path) -> str:
-    """Returns what a user types to run the study again."""
-    return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
+def study_command(name: str, out: str | Path, names_code: bool = False) -> str:
+    """Returns what a user types to run the study again; another one has to trust its code."""
+    return f"sauna study {shlex.quote(name)}{_typed_out(out)}" + " --trust" * names_code
 
 
 def _typed_out(out: str | Path) -> str:
