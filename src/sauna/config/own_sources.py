@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import os
 import subprocess
 from collections.abc import Mapping
 from functools import cache
@@ -79,8 +80,10 @@ def _revision(package: Path) -> str:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(folder), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5)
+    """Asks git, without a lock that would disturb the user's own commands, or a hook's variables."""
+    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
+    env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5, env=env)
     return done.stdout.strip()
 
 
