@@ -80,7 +80,7 @@ def _revision(package: Path) -> str:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Asks git, without a lock that would disturb the user's own commands, or a hook's variables."""
+    """Asks git, without a lock in the way of the user's commands, or a hook's variables."""
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5, env=env)
