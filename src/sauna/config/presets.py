@@ -1,6 +1,6 @@
 """Named settings: presets, arms (which selection method), and how a run's config is resolved.
 
-A preset says how an algorithm trains; an arm says which transitions the update keeps. METHOD, in
+A preset says how an algorithm trains; an arm says which rules a run trains with. METHOD, in
 `docs/concepts/ppo.md`, gives the origin of every number.
 """
 

@@ -183,6 +183,7 @@ def test_a_comparison_says_where_each_arm_ends_and_writes_a_report(tmp_path: Pat
     )
     said = compare_existing([low, high], out=str(tmp_path / "out"))
     assert said[0] == "compared up to 18k env steps; the arms end: low at 20k, high at 18k"
+    assert said[1].startswith("final return here: mean of the returns from 16.2k to 18k env steps")
     assert any("high: better than low" in line and "exact p = 0.029" in line for line in said)
     [report] = (tmp_path / "out").glob("*/report.html")
     page = report.read_text()
