@@ -159,6 +159,7 @@ MISTAKEN = [
     ({"arm": "sauna,sauna+avec"}, "sauna+avec differs from the other arms in"),
     ({"arm": "gigaflow+random+avec+spo+pods"}, "joins sampler gigaflow and sampler pods"),
     ({"arm": "gigaflow+pods"}, "joins sampler gigaflow and sampler pods"),
+    ({"arm": "gigaflow+avec+gigaflow"}, "joins a rule to itself"),
     ({"arm": "gigafow"}, "did you mean 'gigaflow'"),
     ({"sampler": "kondu"}, "did you mean 'kondo'"),
     ({"arm": "pods", "sampler_kwargs": '{"share": Infinity}'}, "JSON has no infinity"),

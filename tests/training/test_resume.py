@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from pathlib import Path
@@ -100,7 +101,7 @@ def finished(tmp_path: Path, **settings) -> Path:
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys) -> None:
     run = finished(tmp_path)
-    expected = (run / "metrics.jsonl").read_bytes()
+    expected, table = (run / "metrics.jsonl").read_bytes(), timeless_table(run)
     (run / "summary.json").unlink()
     newest = checkpoint.numbered(run / "checkpoints")[-1]
     good = (newest / "state.safetensors").read_bytes()
@@ -114,6 +115,17 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys)
     assert (kept / "state.safetensors").read_bytes() == bytes(blob)
     assert (newest / "state.safetensors").read_bytes() == good
     assert (run / "metrics.jsonl").read_bytes() == expected
+    assert timeless_table(run) == table and len(table) > 2
+    seconds = [row["wall_seconds"] for row in run_directory.rows(run, "timing.jsonl")]
+    assert seconds == sorted(seconds)
+
+
+def timeless_table(run: Path) -> list[list[str]]:
+    """`metrics.csv` without the clock's column."""
+    with (run / "metrics.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    clock = rows[0].index("wall_seconds")
+    return [row[:clock] + row[clock + 1 :] for row in rows]
 
 
 def test_a_damaged_newer_checkpoint_takes_no_place_of_a_good_one(tmp_path) -> None:

@@ -12,6 +12,7 @@ from sauna.algorithm.learner.metrics import (
     UpdateMetrics,
     Work,
     head_statistics,
+    policy_std,
     variance_explained,
 )
 from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
@@ -65,6 +66,7 @@ def learn(
         mean_target,
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
+        policy_std(parts.policy.unravel(state.params)),
         sound & jnp.all(jnp.isfinite(state.params)),
         work,
     )

@@ -5,19 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from sauna.config.parsing import many_seeds
+from sauna.config.zoo import entry_for
 from sauna.experiments.statistics import compare
 from sauna.experiments.study.spec import Arm, Spec
 
 
 def before_training(spec: Spec) -> list[str]:
-    """Says if a study has too few seeds to find any difference, or surprisingly many."""
+    """Says which presets are picked, and if there are too few seeds, or surprisingly many."""
     notes = [note for arm in spec.arms if (note := many_seeds(arm.seeds))]
+    notes += [note for arm in spec.arms for note in _picked(arm)]
     for task in spec.tasks:
         arms = {arm.label: arm for arm in spec.arms if task in arm.tasks}
         for baseline in dict.fromkeys(arm.baseline for arm in arms.values() if arm.baseline):
             family = [arm for arm in arms.values() if arm.baseline == baseline]
             notes += _underpowered(task, arms[baseline], family)
     return list(dict.fromkeys(notes))
+
+
+def _picked(arm: Arm) -> list[str]:
+    """Says which presets `auto` stands for in an arm."""
+    picked = {task: entry_for({**arm.settings, "env": task}) for task in arm.tasks}
+    named = "steps" in arm.settings
+    return [entry.said(task, named) for task, entry in picked.items() if entry]
 
 
 def _underpowered(task: str, baseline: Arm, family: list[Arm]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sauna.experiments.report.numbers import digits_of_tasks, interval, number
+from sauna.experiments.report.numbers import aligned, digits_of_tasks, interval, number
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.verdicts import ABLATION
@@ -59,20 +59,14 @@ def ranking_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return aligned(texts)
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Returns rows of texts as lines whose columns stand under each other."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ("  ".join(f"{t:<{w}}" for t, w in zip(row, widths, strict=True)) for row in rows)
-    return [line.rstrip() for line in lines]
-
-
 def _row(row: Mapping[str, Any], digits: int) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
+    stopped = f" ({row['stopped_early']} stopped early)" if row.get("stopped_early") else ""
     mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
     return [
         row["task"],
         row["label"],
-        f"{row['seeds']}{failed}",
+        f"{row['seeds']}{failed}{stopped}",
         interval(row["final_iqm"], digits),
         interval(row["auc_iqm"], digits),
         f"{mean} +- {std}",

@@ -10,11 +10,18 @@ import numpy as np
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 
+SUCCESS_RATE, INFO_PREFIX = "success_rate", "info_"
+
 if TYPE_CHECKING:
     from sauna.algorithm.learner.metrics import UpdateMetrics
     from sauna.algorithm.rollout.collected import Collected
     from sauna.algorithm.types import Hypers
     from sauna.training.loop.member_state import Counters
+
+
+def info_key(name: str) -> str:
+    """The key in a row of a number that environments give in `info`."""
+    return SUCCESS_RATE if name == "is_success" else INFO_PREFIX + name
 
 
 def metrics_row(
@@ -52,6 +59,8 @@ def metrics_row(
     if config.gae_over == "kept" and counters.reported_returns:
         # The released code logs only episodes whose last step was kept.
         row["return_mean_reported"] = float(np.mean(counters.reported_returns))
+    for name, number in collected.info.items():
+        row[info_key(name)] = number
     scalars = learned._asdict() | learned.work._asdict()
     for name, value in scalars.items():
         if name not in ("finite", "work") and math.isfinite(value):
