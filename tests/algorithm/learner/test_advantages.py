@@ -16,7 +16,6 @@ from sauna.algorithm.learner.samples import advantages_over_all, make_batch
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.types import Hypers, Rollout
 
-
 over_all = jax.jit(advantages_over_all, static_argnums=2)  # one program, not one per operation
 
 
