@@ -16,11 +16,11 @@ import pytest
 import sauna
 from command_line import sauna_here
 from helpers import SMALL, own
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.report.curve import interval, member_curves
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
+from sauna.training.artifact import load_artifact
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent

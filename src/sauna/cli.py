@@ -86,7 +86,10 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    add_fields(resume, fields_with("resumable"), {**values, **dict.fromkeys(FIELDS, "")})
+    text = "with more --steps: schedules begin anew over those that are added"
+    resume.add_argument("--restart-schedule", action="store_true", help=text)
+    changeable = (*fields_with("extends_run"), *fields_with("resumable"))
+    add_fields(resume, changeable, {**values, **dict.fromkeys(FIELDS, "")})
 
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
@@ -98,6 +101,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate.add_argument("--env-kwargs", metavar="JSON", help=text)
     text = "the iteration of a kept checkpoint (default: the newest)"
     evaluate.add_argument("--checkpoint", metavar="N", help=text)
+    text = "each member as it was at its best evaluation during training"
+    evaluate.add_argument("--best", action="store_true", help=text)
     evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
@@ -241,7 +246,8 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
     from sauna.training.pick import pick
 
-    stored = _overrides_in(values.pop("config"), values.pop("trust"))
+    trust = values.pop("trust")
+    stored = _overrides_in(values.pop("config"), trust)
     env = values.pop("env")
     picked = pick(_over(stored, values | ({"env": env} if env else {})))
     overrides = translate(picked.overrides)
@@ -249,7 +255,7 @@ def _train(values: dict[str, Any]) -> None:
     if runs.follows(overrides):
         runs.follow(overrides, display)
         return
-    run = runs.start(overrides, display, picked.found)
+    run = runs.start(overrides, display, picked.found, trust)
     if picked.said:
         display.say(picked.said)
     train_and_draw(run, display, resume=False)
@@ -281,7 +287,8 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
 
     path = Path(values.pop("run"))
-    inexact, *how = (values.pop(name) for name in ("inexact", "trust", "accept_changed_code"))
+    names = ("inexact", "trust", "accept_changed_code", "restart_schedule")
+    inexact, *how = (values.pop(name) for name in names)
     display = make_display()
     run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)

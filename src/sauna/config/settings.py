@@ -64,7 +64,7 @@ def parse(name: str, value: Any) -> Any:
 
 
 def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:
-    if isinstance(value, str | bool):
+    if value is None or isinstance(value, str | bool):
         return
     if isinstance(value, int) and abs(value) >= 2**63:
         raise BadInput(f"{name}: must be a number of at most 63 bits")

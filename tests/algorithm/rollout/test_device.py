@@ -287,8 +287,9 @@ def test_bad_input_is_refused(
 
 @slow
 def test_the_environment_of_the_docs_trains(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(TESTS).parent / "docs" / "device.md").read_text()
-    (tmp_path / "my_envs.py").write_text(text.split("```python\n")[1].split("```")[0])
+    text = (Path(TESTS).parent / "docs" / "how-to" / "gpu.md").read_text()
+    code = text.split('```python title="my_envs.py"\n')[1].split("```")[0]
+    (tmp_path / "my_envs.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     result = train_here(make_job("my_envs:near_zero", arm="ppo", envs=2))
     assert result.rows[-1]["env_steps"] == 128

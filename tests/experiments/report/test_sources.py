@@ -10,6 +10,7 @@ import pytest
 from matplotlib import image
 
 from command_line import sauna
+from sauna.experiments.report import curve
 from sauna.experiments.report.curve import plot
 from sauna.experiments.report.sources import Curve, Source, read_scalars, read_sources
 from sauna.experiments.study.existing import compare_existing, results_of
@@ -126,6 +127,27 @@ def test_run_directories_are_read_arm_by_arm(tmp_path: Path) -> None:
     (one / "metrics.jsonl").write_text("")
     with pytest.raises(BadInput, match="no episode has finished"):
         read_sources([one])
+
+
+def test_evaluations_are_drawn_beside_the_training_return(tmp_path: Path, monkeypatch) -> None:
+    drawn: list[tuple[str, list[float]]] = []
+    monkeypatch.setattr(
+        curve,
+        "_draw_arm",
+        lambda axes, label, members, look: drawn.append(
+            (label, [y for _, line in members.values() for y in line])
+        ),
+    )
+    rows = [
+        {"arm": "ppo", "member": "ppo/0", "seed": 0, "iteration": i, "env_steps": 10 * i}
+        | {"return_mean": float(i)}
+        | ({"eval_return_mean": 7.0} if i == 2 else {})
+        for i in range(3)
+    ]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "config.json").write_text(json.dumps({"config": {"env": "A", "preset": "p"}}))
+    assert plot([tmp_path]) == tmp_path / "figures" / "learning_curve.png"
+    assert drawn == [("ppo", [0.0, 1.0, 2.0]), ("ppo, evaluations", [7.0])]
 
 
 def test_only_steps_that_all_curves_have_are_compared() -> None:

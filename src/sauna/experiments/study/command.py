@@ -44,6 +44,7 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
 from sauna.system.working_folder import kept_folder
+from sauna.training.display import counted
 from sauna.training.prepare import examine, look_at, place
 
 
@@ -266,7 +267,8 @@ def _run_looks(
     found = next_round(spec, size, folder)
     while found.waiting is not None and not noted:
         seeds, arms = spec.looks[found.look].seeds, len(found.waiting.arms)
-        say(f"look {found.look + 1} of {len(spec.looks)}: {arms} arms up to {seeds} seeds")
+        up_to = f"{counted(arms, 'arm')} up to {counted(seeds, 'seed')}"
+        say(f"look {found.look + 1} of {len(spec.looks)}: {up_to}")
         run(found.waiting, round_units(found))
         before, found = found, next_round(spec, size, folder)
         for text in stopped(before.replays, found.replays):
@@ -282,8 +284,8 @@ def _opening(spec: Spec, place: Path) -> str:
     members = sum(len(arm.seeds) * len(arm.tasks) for arm in spec.arms)
     most = "at most " if spec.looks else ""
     return (
-        f"{spec.name}: {len(spec.arms)} arms, {len(spec.tasks)} tasks, {most}{members} members; "
-        f"writing to {place}"
+        f"{spec.name}: {counted(len(spec.arms), 'arm')}, {counted(len(spec.tasks), 'task')}, "
+        f"{most}{counted(members, 'member')}; writing to {place}"
     )
 
 

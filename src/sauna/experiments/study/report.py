@@ -27,6 +27,7 @@ from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.summary import ABLATION
 from sauna.system.safe_write import replace_file
+from sauna.training.display import counted
 
 # A shape beside the colour of each kind of verdict.
 MARKS = {
@@ -165,18 +166,14 @@ def scope(results: Mapping[str, Any]) -> list[str]:
     """Returns how much was trained."""
     cells = results["cells"]
     return [
-        _plural(len({cell["task"] for cell in cells}), "task"),
-        _plural(len({cell["label"] for cell in cells}), "arm"),
-        _plural(_counts(results).total(), "training"),
+        counted(len({cell["task"] for cell in cells}), "task"),
+        counted(len({cell["label"] for cell in cells}), "arm"),
+        counted(_counts(results).total(), "training"),
     ]
 
 
 def _counts(results: Mapping[str, Any]) -> Counter[str]:
     return Counter(member["status"] for cell in results["cells"] for member in cell["members"])
-
-
-def _plural(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def totals(found: Sequence[Mapping[str, Any]]) -> str:

@@ -153,6 +153,7 @@ def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
 
 def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
     final = cell.values("final_return")
+    stopped = sum("stopped_early" in member for member in cell.complete)
     return {
         "task": cell.task,
         "label": cell.label,
@@ -169,6 +170,7 @@ def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
         "kept_steps": cell.mean("kept_steps"),
         "samples_backward": cell.mean("samples_backward"),
         "improvement": list(comparison.improvement) if comparison else None,
+        **({"stopped_early": stopped} if stopped else {}),
     }
 
 

@@ -61,11 +61,12 @@ def ranking_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _row(row: Mapping[str, Any], digits: int) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
+    stopped = f" ({row['stopped_early']} stopped early)" if row.get("stopped_early") else ""
     mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
     return [
         row["task"],
         row["label"],
-        f"{row['seeds']}{failed}",
+        f"{row['seeds']}{failed}{stopped}",
         interval(row["final_iqm"], digits),
         interval(row["auc_iqm"], digits),
         f"{mean} +- {std}",

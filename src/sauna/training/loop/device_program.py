@@ -264,6 +264,15 @@ class Population:
             reports.append(jax.device_get(report))
         return reports
 
+    def stop(self, members: list[int]) -> None:
+        """Leaves these members as they are from now on: their budget holds no further rollout."""
+        for p in members:
+            if self._one_by_one:
+                self._settings[p] = self._settings[p]._replace(steps=jnp.int32(1))
+            else:
+                steps = self._settings.steps.at[p].set(1)
+                self._settings = self._settings._replace(steps=steps)
+
     def states(self) -> list[MemberState]:
         """Every member's state, as numpy arrays (and JAX keys)."""
         if self._one_by_one:

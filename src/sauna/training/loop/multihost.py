@@ -136,6 +136,9 @@ class Follower:
     def allowance(self, iteration: int) -> int:
         return 1  # machine 0 says how many
 
+    def stopped(self) -> set[str]:
+        return set()
+
     def iteration(self, iteration: int, rows: Any, timing: Any) -> None:
         pass
 
