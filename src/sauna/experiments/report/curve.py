@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from sauna.experiments.report import style
 from sauna.experiments.report.sources import Source, read_sources
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, one_line
 
 TRAINING_RETURN = "training return\n(last 100 episodes)"
 EVALUATED = "return: training (last 100 episodes),\nevaluations (dotted)"
@@ -50,9 +51,16 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_curve(run: Path) -> Path | None:
-    """Draws `figures/learning_curve.png` of a run; None if no episode has finished."""
-    figure = curve_figure(run)
-    return figure and _saved(figure, run / "figures" / "learning_curve.png")
+    """Draws `figures/learning_curve.png` of a run that was trained; None if that is not possible.
+
+    What keeps it from being drawn costs nothing else: the training has ended well.
+    """
+    try:
+        figure = curve_figure(run)
+        return figure and _saved(figure, run / "figures" / "learning_curve.png")
+    except Exception as error:  # of a disk that is full, or of Matplotlib
+        print(f"warning: no learning curve was drawn: {one_line(error)}", file=sys.stderr)
+        return None
 
 
 def curve_figure(run: Path) -> Any:
