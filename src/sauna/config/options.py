@@ -188,9 +188,11 @@ class Config:
         read_when=readers.PPO,
     )
     clip_value: bool = _learning(
-        True, "clip the value function's change as the ratio's", read_when=readers.PPO
+        True, "clip the value function's change as the ratio's", read_when=readers.SQUARED
     )
-    normalize_advantages: bool = _learning(True, "standardise the advantages of each minibatch")
+    normalize_advantages: bool = _learning(
+        True, "standardise the advantages of each minibatch", read_when=readers.CENTRED
+    )
     entropy_coef: float = _learning(
         0.0, "weight of the entropy bonus", at_least=0, shapes_program=False
     )
@@ -273,8 +275,8 @@ class Config:
     )
     selection_mode: str = _selection(
         "fewer",
-        "fewer gradient steps on minibatches of the same size, as many steps on smaller ones, or "
-        "as many of the same size, refilled with what was taken",
+        "fewer gradient steps on minibatches of PPO's size (or as near below it as fills them), as "
+        "many steps on smaller ones, or as many of PPO's size, refilled with what was taken",
         choices=("fewer", "smaller", "refill"),
         read_when=readers.MASKED,
     )

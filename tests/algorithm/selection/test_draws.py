@@ -36,7 +36,7 @@ def minibatches(mode: str, keep: np.ndarray, order: np.ndarray) -> list[np.ndarr
     rows, number = _kept_first(jnp.asarray(keep), jnp.asarray(order))
     size = minibatch_size(mode, FULL, MINIBATCHES, ROWS)
     found = []
-    for i in range(int(minibatch_count(mode, number, FULL, MINIBATCHES))):
+    for i in range(int(minibatch_count(mode, number, size, MINIBATCHES))):
         places, counts = minibatch_places(mode, jnp.int32(i), number, size, MINIBATCHES)
         assert places.shape == counts.shape == (size,)
         found.append(np.asarray(rows)[np.asarray(places)][np.asarray(counts)])
@@ -95,6 +95,17 @@ def test_all_rows_make_ppos_own_minibatches_in_every_mode() -> None:
     for mode in ("fewer", "smaller", "refill"):
         got = minibatches(mode, np.ones(ROWS, bool), order)
         np.testing.assert_array_equal(np.stack(got), order.reshape(MINIBATCHES, FULL))
+
+
+@given(st.integers(1, 60), st.integers(1, 600))
+def test_fewer_steps_take_hardly_a_row_twice(full: int, length: int) -> None:
+    """Of a static number of rows: as few steps as PPO's size allows, and less than one row each."""
+    size = minibatch_size("fewer", full, 4, length)
+    count = int(minibatch_count("fewer", jnp.int32(length), size, 4))
+    assert size <= full and count == -(-length // full)
+    assert 0 <= count * size - length < count
+    if length % full == 0:
+        assert size == full
 
 
 def test_a_draw_holds_as_many_rows_as_are_kept_or_asked_for() -> None:

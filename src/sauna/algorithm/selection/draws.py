@@ -61,14 +61,20 @@ def by_probability(probability: Array, uniform: Array) -> Array:
 
 
 def minibatch_size(mode: str, full: int, minibatches: int, length: int) -> int:
-    """Gives the rows of one minibatch; `full` is PPO's own size."""
-    return math.ceil(length / minibatches) if mode == "smaller" else full
+    """Gives the rows of one minibatch; `full` is PPO's own size.
+
+    `length` rows that do not fill whole minibatches of PPO's size are shared out evenly, so that
+    hardly a row goes through the network only to fill the last one.
+    """
+    if mode == "smaller":
+        return math.ceil(length / minibatches)
+    return math.ceil(length / math.ceil(length / full)) if mode == "fewer" else full
 
 
-def minibatch_count(mode: str, number: Array, full: int, minibatches: int) -> Array:
+def minibatch_count(mode: str, number: Array, size: int, minibatches: int) -> Array:
     """Gives the gradient steps of one epoch that has drawn `number` rows; none for 0 rows."""
     if mode == "fewer":
-        return (number + full - 1) // full
+        return (number + size - 1) // size
     if mode == "smaller":
         return jnp.minimum(number, minibatches)
     return jnp.where(number > 0, minibatches, 0)
@@ -81,7 +87,7 @@ def minibatch_places(
 
     | mode | minibatches | a minibatch |
     |---|---|---|
-    | `fewer` | as many as the rows fill | PPO's size; the last is filled from the front |
+    | `fewer` | as many as the rows fill | at most PPO's size; the last is filled from the front |
     | `smaller` | as many as without a rule, at most one a row | an equal share of the rows |
     | `refill` | as many as without a rule | PPO's size; the rows are gone through again |
     """

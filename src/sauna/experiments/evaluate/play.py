@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from sauna.envs.host.answers import one_number, reset_with
 from sauna.experiments.evaluate import MAX_STEPS
-
-if TYPE_CHECKING:
-    from sauna.experiments.evaluate.policy import TrainedPolicy
 
 QUIET = 10.0  # seconds without a word, after which an evaluation says how far it is
 
@@ -24,7 +21,7 @@ class Episode(NamedTuple):
 
 
 def play(
-    policy: TrainedPolicy,
+    policy: Callable[..., Any],
     env: Any,
     deterministic: bool,
     seed: int,
@@ -34,6 +31,7 @@ def play(
     """One episode, cut after `max_steps` env steps.
 
     Args:
+      policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes.
       watch: called after the reset and after each env step.
     """
     import jax

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -40,15 +41,15 @@ class TrainedPolicy:
         env = env or make_env(self.config.env, json.loads(self.config.env_kwargs))
         check_spaces(artifact, env)
         self._read = observation_reader(env.observation_space)
-        self._write = action_writer(env.action_space, self.config.rescale_actions)
+        self.write = action_writer(env.action_space, self.config.rescale_actions)
         if made:
             close(env)
         own = under(self.name + "/", artifact.checkpoint.arrays)
         if len(self.config.hidden) > len(own):  # each layer has arrays of its own
             raise BadCheckpoint(f"{artifact.checkpoint.path}: it lacks layers that its config has")
-        self._policy: Policy = make_policy(self.config, artifact.spaces)
-        example = jax.eval_shape(self._policy.init, jax.random.key(0))
-        self._params = flat_params(self._policy, example, under("params/", own))
+        self.policy: Policy = make_policy(self.config, artifact.spaces)
+        example = jax.eval_shape(self.policy.init, jax.random.key(0))
+        self.params = flat_params(self.policy, example, under("params/", own))
         if self.config.normalize_observations:
             size = artifact.spaces.observation_shape
             parts = {"mean": size, "variance": size, "count": (1,)}
@@ -61,10 +62,11 @@ class TrainedPolicy:
         self._dtype = artifact.spaces.observation_dtype
         self._act = jax.jit(self._choose, static_argnames="deterministic")
         self._predict = jax.jit(self._heads)
+        self._log_prob = jax.jit(self._likelihood)
 
     def _choose(self, observation: Any, key: Any, *, deterministic: bool) -> Any:
-        distribution = self._policy.distribution
-        parameters = self._policy.apply(self._params, observation).policy
+        distribution = self.policy.distribution
+        parameters = self.policy.apply(self.params, observation).policy
         if deterministic:
             return distribution.mode(parameters)
         return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
@@ -74,11 +76,15 @@ class TrainedPolicy:
 
         Sampled actions need a JAX `key`; the normaliser is never updated.
         """
+        return self.write(self.act(observation, deterministic=deterministic, key=key))
+
+    def act(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> np.ndarray:
+        """What the network chooses for one raw observation `[A]`, neither clipped nor stretched."""
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
         key = jax.random.key(0) if key is None else key
         action = self._act(self.see(observation)[None], key, deterministic=deterministic)
-        return self._write(np.asarray(action)[0])
+        return np.asarray(action)[0]
 
     def see(self, observation: Any) -> np.ndarray:
         """What the network gets of one raw observation `[*obs]`: float32, normalised; or uint8."""
@@ -88,16 +94,31 @@ class TrainedPolicy:
         return seen[0].astype(self._dtype)
 
     def _heads(self, observation: Any) -> Any:
-        output = self._policy.apply(self._params, observation)
+        output = self.policy.apply(self.params, observation)
         return output.value, output.vex
+
+    def _likelihood(self, observation: Any, action: Any) -> Any:
+        output = self.policy.apply(self.params, observation)
+        return self.policy.distribution.log_prob(output.policy, action)
 
     def predict(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V and the Vex head, `[L]` each, at what the network got `[L, *obs]`."""
-        found = []
-        for first in range(0, len(seen), CHUNK):
-            part = seen[first : first + CHUNK]
-            padded = np.zeros((CHUNK, *part.shape[1:]), part.dtype)
-            padded[: len(part)] = part
-            found.append([np.asarray(head)[: len(part)] for head in self._predict(padded)])
-        value, vex = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        value, vex = _in_chunks(self._predict, seen)
         return value, vex
+
+    def log_prob(self, seen: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """Log-probabilities `[L]` of what the network chose `[L, A]` at what it got `[L, *obs]`."""
+        (found,) = _in_chunks(lambda *rows: (self._log_prob(*rows),), seen, action)
+        return found
+
+
+def _in_chunks(function: Callable[..., tuple[Any, ...]], *rows: np.ndarray) -> list[np.ndarray]:
+    """What `function` gives for rows `[L, ...]`, asked for `CHUNK` of them at a time."""
+    found = []
+    for first in range(0, len(rows[0]), CHUNK):
+        parts = [x[first : first + CHUNK] for x in rows]
+        padded = [np.zeros((CHUNK, *x.shape[1:]), x.dtype) for x in parts]
+        for place, part in zip(padded, parts, strict=True):
+            place[: len(part)] = part
+        found.append([np.asarray(x)[: len(parts[0])] for x in function(*padded)])
+    return [np.concatenate(parts) for parts in zip(*found, strict=True)]
