@@ -26,7 +26,7 @@ slow = pytest.mark.slow
 RULES = [arm for arm in ARMS if arm not in ("ppo", "random-drop", "sauna-reference")]
 SAMPLERS = [arm for arm in ARMS if ARMS[arm].get("sampler", "none") != "none"]
 FAST = "gigaflow+random"
-STATEFUL = {"gigaflow+random": 1, "prioritized": 1, "kondo": 0}
+STATEFUL = {"gigaflow+random": 1, "prioritized": 1, "kondo": 0, "sauna+random": 0}
 WALK = {"envs": 2, "steps": 512}
 
 

@@ -301,6 +301,7 @@ class Config:
         "clip",
         "the policy term: PPO's clip, SPO's penalty, or neither",
         choices=("clip", "spo", "unclipped"),
+        plugin=True,
         read_when=readers.PPO,
     )
     loss_weight: str = _update(
@@ -326,6 +327,7 @@ class Config:
         "squared",
         "the value loss: squared errors, or their variance (AVEC)",
         choices=("squared", "avec"),
+        plugin=True,
     )
     recompute_advantages: bool = _update(
         False, "compute values and advantages anew before each epoch", read_when=readers.PPO

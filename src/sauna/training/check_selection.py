@@ -44,6 +44,13 @@ def check_selection(config: Config, spaces: Spaces) -> None:
         _check_weight(config.loss_weight, rules.loss_weight, size, continuous)
     if rules.stop is not None and ":" in config.stop:
         _check_stop(config.stop, rules.stop, size)
+    number, one = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((size,), ()))
+    if rules.objective is not None and ":" in config.objective:
+        terms = jax.eval_shape(rules.objective, number, number, one)
+        _check_array(f"objective: {config.objective}", "terms", terms, (size,), False)
+    if rules.critic is not None and ":" in config.critic:
+        loss = jax.eval_shape(rules.critic, number, number)
+        _check_array(f"critic: {config.critic}", "a loss", loss, (), False)
 
 
 def _check_arguments(config: Config, spaces: Spaces) -> None:

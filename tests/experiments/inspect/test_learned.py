@@ -263,7 +263,8 @@ def test_a_dropped_step_is_no_sample() -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A filter of one's own, then a sampler, in two environments."""
     settings = {**SMALL, "arm": "sauna+top-advantage", "rollout_steps": 16, "steps": 64, "envs": 2}
-    own = {"filter": "own_rules:likely", "filter_kwargs": '{"least": -2.5}', "dropped": "mask"}
+    settings |= {"sampler_kwargs": {"share": 0.3}}
+    own = {"filter": "own_rules:likely", "filter_kwargs": '{"least": -3.6}', "dropped": "mask"}
     out = tmp_path_factory.mktemp("rules") / "run"
     with trained_here():
         return sauna.train("worlds:Scripted", quiet=True, out=out, **settings, **own).path
@@ -283,7 +284,7 @@ def test_a_filter_of_ones_own_sees_actions_values_and_log_probabilities(
     mean, log_std = np.split(np.asarray(output.policy, float), 2, -1)
     z = (found.played.action - mean) / np.exp(log_std)
     log_prob = -(0.5 * z**2 + log_std + 0.5 * np.log(2 * np.pi)).sum(-1)
-    np.testing.assert_array_equal(found.decisions.keep, log_prob >= -2.5)
+    np.testing.assert_array_equal(found.decisions.keep, log_prob >= -3.6)
     assert 0 < found.decisions.keep.sum() < len(log_prob), "with zeros it would keep all"
 
 
@@ -291,7 +292,9 @@ def test_the_page_shows_what_is_taken_and_why(found: Inspection) -> None:
     data, made, keep = page_data(found), found.learned, found.decisions.keep
     assert made is not None and data["keep"] == made.taken.astype(int).tolist()
     assert 0 < made.taken.sum() < keep.sum() and not made.taken[~keep].any()
-    assert data["words"] == ("taken", "left out") and data["panels"][0]["name"] == "score"
+    assert data["words"] == ("taken", "left out") and [panel["name"] for panel in data["panels"]][
+        :2
+    ] == ["vex", "score"]
     shown = np.array(data["series"]["score"], float)
     np.testing.assert_array_equal(np.isnan(shown), ~keep)
     size = np.abs(found.advantage)
@@ -328,7 +331,8 @@ def test_a_rule_that_takes_no_subset_says_so(found: Inspection, arm: str) -> Non
         found.member.config, sampler="none", filter="none", vex_coef=0.0, **settings
     )
     assert not reads_rollouts(plain)
-    bare = found._replace(member=found.member._replace(config=plain), learned=None)
+    member = found.member._replace(config=plain)
+    bare = found._replace(member=member, learned=None, head=False)
     (said,) = [text for text in notes(bare) if text.startswith("No subset is taken by: ")]
     assert sentence in said and "Every step is learned from." in said
     assert set(page_data(bare)["series"]) == {
