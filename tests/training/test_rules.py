@@ -12,6 +12,7 @@ import pytest
 from arrays import random_rollout
 from helpers import configured, equal, make_job, resumed, train_here
 from sauna.algorithm.learner.program import make_learner, make_parts
+from sauna.algorithm.learner.selected import drawn_length
 from sauna.algorithm.learner.update import device_minibatch_order
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.selection.control import controlled_filter
@@ -131,7 +132,8 @@ def test_the_device_learns_what_the_host_learns(arm: str) -> None:
     device, told = jax.jit(
         lambda state, rollout: learn_from(parts, state, rollout, setting, h, iteration)
     )(learner.init(keys.init), rollout)
-    order = device_minibatch_order(config, jax.random.fold_in(keys.order, iteration))
+    own = jax.random.fold_in(keys.order, iteration)
+    order = device_minibatch_order(config, own, drawn_length(parts.learning))
     key = selection_key(keys, iteration)
     batch = learner.make_batch(rollout, h, key)
     host, said = learner.learn(learner.init(keys.init), rollout, batch, h, order, key)

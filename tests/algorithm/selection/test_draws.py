@@ -115,6 +115,10 @@ def test_a_draw_holds_as_many_rows_as_are_kept_or_asked_for() -> None:
     assert some.number == 8 and some.rows.shape == (10,)
     np.testing.assert_array_equal(some.rows[:8], np.arange(21, -1, -3))
     np.testing.assert_array_equal(some.rows, some.value_rows)
+    turned = jnp.array([3, 9, 1, 0, 7, 2, 8, 6, 5, 4], jnp.int32)  # of the first ten kept rows
+    few = draw(Choice(keep=keep), turned, jax.random.key(0), 10)
+    assert few.number == 8, "places 8 and 9 hold rows that are not kept: they come last"
+    np.testing.assert_array_equal(few.rows[:8], 3 * np.array([3, 1, 0, 7, 2, 6, 5, 4]))
     p = jnp.ones(ROWS) / ROWS
     drawn = draw(Choice(probability=p), order, jax.random.key(0), 10)
     assert drawn.number == 10

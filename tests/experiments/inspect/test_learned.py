@@ -18,10 +18,10 @@ from algorithm.selection import oracle, oracle_loss
 from arrays import hypers, random_rollout
 from faults.canned import trained_here
 from helpers import SMALL, configured
-from sauna.algorithm.learner.program import Learner, make_learner
+from sauna.algorithm.learner.program import Learner, make_learner, make_parts
+from sauna.algorithm.learner.update import Parts
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState
-from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -39,7 +39,7 @@ slow = pytest.mark.slow
 class Asked(NamedTuple):
     """Two rollouts of one member, and what the page would show of them."""
 
-    config: Config
+    parts: Parts
     policy: Policy
     learner: Learner
     state: TrainState
@@ -67,7 +67,8 @@ def asked(arm: str, envs: int = ENVS, **settings: Any) -> Asked:
     spans = decide(config, scored, jax.random.key(0), h).spans
     assert len(spans) == ROLLOUTS and all(span.keep.all() for span in spans)
     given = config, policy, SPACES, state, streams, spans, h, SEED, ITERATION
-    return Asked(config, policy, learner, state, h, streams, learned(*given))
+    parts = make_parts(config, policy, SPACES)
+    return Asked(parts, policy, learner, state, h, streams, learned(*given))
 
 
 def rollouts(made: Asked) -> list[Rollout]:
@@ -168,7 +169,7 @@ def test_rows_are_drawn_by_numpys_probabilities(sampler: str) -> None:
     draws, weights, taken = [], [], []
     for i, rollout in enumerate(rollouts(made)):
         p, weight = probabilities(sampler, made, rollout, i)
-        key, _ = draws_of(made.config, SEED, ITERATION + i)
+        key, *_ = draws_of(made.parts, SEED, ITERATION + i)
         uniform = np.asarray(jax.random.uniform(jax.random.fold_in(key, 1), (ROWS,)), float)
         rows = np.searchsorted(np.cumsum(p), uniform, side="right")
         taken.append(np.isin(np.arange(ROWS), rows))
@@ -218,7 +219,7 @@ def test_sample_dropout_leaves_out_what_has_gone_far_by_the_end_of_the_update() 
     assert (made.found.first_weight == 1).all()
     keep = []
     for i, rollout in enumerate(rollouts(made)):
-        key, order = draws_of(made.config, SEED, ITERATION + i)
+        key, order, _ = draws_of(made.parts, SEED, ITERATION + i)
         batch = made.learner.make_batch(rollout, made.hypers, key)
         own = jax.tree.map(jnp.copy, made.state)
         updated, _ = made.learner.learn(own, rollout, batch, made.hypers, order, key)

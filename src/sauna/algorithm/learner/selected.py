@@ -76,7 +76,8 @@ def update_on_selected(
 
     Args:
       batch: `[M]` samples; rollout: where they are from.
-      order: `[epochs, M]` int32, a permutation for each epoch.
+      order: `[epochs, M]` int32, a permutation for each epoch; or of the first K = `drawn_length`
+        rows that are kept.
       key: of this iteration's draws.
     """
     sampler = parts.rules.sampler
@@ -196,7 +197,8 @@ def _epoch(
 ) -> tuple[TrainState, Totals]:
     config = parts.config
     drawn = _drawn(choice, batch, order, key, parts)
-    mode, full = config.selection_mode, len(order) // config.minibatches
+    mode = config.selection_mode
+    full = config.rollout_steps * config.envs // config.minibatches
     size = minibatch_size(mode, full, config.minibatches, drawn_length(parts))
     steps = minibatch_count(mode, drawn.number, size, config.minibatches)
     kept = drawn.number

@@ -27,7 +27,7 @@ def draw(choice: Choice, permutation: Array, key: Array, length: int) -> Draw:
     """
     number = jnp.int32(length)
     if choice.probability is None:
-        index, number = kept_first(choice.keep, permutation)
+        index, number = kept_in_order(choice.keep, permutation)
         index, number = index[:length], jnp.minimum(number, length)
     else:
         index = by_probability(choice.probability, jax.random.uniform(key, (length,)))
@@ -36,6 +36,21 @@ def draw(choice: Choice, permutation: Array, key: Array, length: int) -> Draw:
         other = jax.random.uniform(jax.random.fold_in(key, 1), (length,))
         value_index = by_probability(choice.value_probability, other)
     return Draw(index, value_index, number)
+
+
+def kept_in_order(keep: Array, permutation: Array) -> tuple[Array, Array]:
+    """Puts the kept rows first, in the order of a permutation of all rows or of that many of them.
+
+    Returns:
+      as many rows as the permutation has, and how many of them are kept.
+    """
+    length = len(permutation)
+    if length == len(keep):
+        return kept_first(keep, permutation)
+    rows, number = kept_first(keep, jnp.arange(len(keep), dtype=permutation.dtype))
+    number = jnp.minimum(number, length)
+    places, _ = kept_first(jnp.arange(length) < number, permutation)
+    return rows[places], number
 
 
 def kept_first(keep: Array, permutation: Array) -> tuple[Array, Array]:

@@ -76,17 +76,17 @@ def learned(
       streams: `[L, N, ...]`, of which `spans` cuts the rollouts.
       iteration: of the first rollout.
     """
-    learner = make_learner(config, policy, spaces)
-    asked = jax.jit(partial(ask, parts=make_parts(config, policy, spaces)))
-    weighed = jax.jit(partial(weigh, parts=make_parts(config, policy, spaces)))
+    learner, parts = make_learner(config, policy, spaces), make_parts(config, policy, spaces)
+    asked, weighed = jax.jit(partial(ask, parts=parts)), jax.jit(partial(weigh, parts=parts))
     found: dict[str, np.ndarray] = {}
     for i, span in enumerate(spans, iteration):
-        key, order = draws_of(config, seed, i)
+        key, order, every = draws_of(parts, seed, i)
         rollout = controlled_rollout(rollout_of(streams, span), hypers, key, config)
         batch = learner.make_batch(rollout, hypers, key)
         after, columns = asked(state, batch, order, key)
         if config.loss_weight != "none":
-            columns |= _weights(learner, weighed, state, rollout, batch, hypers, order, key)
+            draws = key, order, every
+            columns |= _weights(learner, weighed, state, rollout, batch, hypers, draws)
         rows = np.asarray(kept_rows(rollout.keep, config.rollout_steps))[:, 0]
         there = np.asarray(batch.weight).reshape(len(rows), -1)[:, 0] > 0
         for name, values in columns.items():
@@ -100,14 +100,16 @@ def learned(
     return Learned(taken, *(found.get(name) for name in Learned._fields[1:]))
 
 
-def draws_of(config: Config, seed: int, iteration: int) -> tuple[Array, Any]:
-    """The key of an iteration's draws, and the order of its samples in each epoch."""
-    keys = member_keys(seed)
+def draws_of(parts: Parts, seed: int, iteration: int) -> tuple[Array, Any, Any]:
+    """The key of an iteration's draws, the order of each epoch, and one of all rows `[M]`."""
+    config, keys = parts.config, member_keys(seed)
     key = selection_key(keys, iteration)
     if config.backend == "device":
         own = jax.random.fold_in(keys.order, iteration)
-        return key, device_minibatch_order(config, own)
-    return key, minibatch_order(config, seed, iteration)
+        few = device_minibatch_order(config, own, drawn_length(parts))
+        return key, few, device_minibatch_order(config, own)[0]
+    order = minibatch_order(config, seed, iteration)
+    return key, order, order[0]
 
 
 def rollout_of(streams: Rollout, span: Span) -> Rollout:
@@ -148,31 +150,33 @@ def weigh(
     params: Array,
     state: TrainState,
     batch: Batch,
-    order: Array,
-    key: Array,
+    draws: tuple[Array, Any, Any],
     *,
     parts: Parts,
 ) -> tuple[Array, Array]:
     """Mask and scale `[M]` that the loss weight gives the rows under a policy's `params`.
 
-    The rows come in the first epoch's order, as a control deals weights to the next row.
+    Args:
+      draws: see `draws_of`; the rows come in the last one's order, as a control deals weights to
+        the next row.
     """
     config, distribution = parts.config, parts.policy.distribution
     assert parts.rules.loss_weight is not None
+    key, order, every = draws
     _, choice, _ = first_draw(state, batch, order, key, parts=parts)
     present = batch.weight if choice.keep is None else batch.weight * choice.keep
     over = batch.weight if config.normalize_over == "rollout" else present
-    rows = jax.tree.map(lambda x: x[order[0]], batch)
+    rows = jax.tree.map(lambda x: x[every], batch)
     rows = rows._replace(
-        advantage=loss_advantage(batch.advantage, over, config)[order[0]],
-        weight=present[order[0]],
+        advantage=loss_advantage(batch.advantage, over, config)[every],
+        weight=present[every],
     )
     output = parts.policy.apply(params, rows.observation)
     log_prob = distribution.log_prob(output.policy, rows.action)
     entropy = distribution.entropy(output.policy)
     terms = loss_terms(rows, rows.advantage, rows.weight, log_prob, entropy, distribution)
     mask, scale = parts.rules.loss_weight.weight(terms)
-    back = jnp.argsort(order[0])
+    back = jnp.argsort(every)
     return mask[back], scale[back]
 
 
@@ -183,14 +187,13 @@ def _weights(
     rollout: Rollout,
     batch: Batch,
     hypers: Hypers,
-    order: Any,
-    key: Array,
+    draws: tuple[Array, Any, Any],
 ) -> dict[str, Array]:
     """The loss weight before and after the update of a rollout, as columns `[M]` of `Learned`."""
-    own = jax.tree.map(jnp.copy, state)  # `learn` takes over its memory
-    updated, _ = learner.learn(own, rollout, batch, hypers, order, key)
-    mask, scale = weighed(state.params, state, batch, order, key)
-    last_mask, last_scale = weighed(updated.params, state, batch, order, key)
+    own, (key, order, _) = jax.tree.map(jnp.copy, state), draws
+    updated, _ = learner.learn(own, rollout, batch, hypers, order, key)  # takes over own's memory
+    mask, scale = weighed(state.params, state, batch, draws)
+    last_mask, last_scale = weighed(updated.params, state, batch, draws)
     return {
         "first_weight": mask * scale,
         "last_weight": last_mask * last_scale,
