@@ -3,7 +3,7 @@
 python benchmarks/flagrun_ports.py            the tables of the page from the result file
 python benchmarks/flagrun_ports.py --measure  measures first (a quarter of an hour), which needs
                                               `pip install pybullet-envs-gymnasium`
-python benchmarks/flagrun_ports.py --stills   draws the pictures of docs/reference/flagrun.md
+python benchmarks/flagrun_ports.py --frames   draws the pictures of docs/reference/flagrun.md
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def insert(path: Path, name: str, text: str) -> None:
     path.write_text(f"{head}{begin}\n{text}\n{end}{rest.split(end)[1]}")
 
 
-def stills() -> None:
+def frames() -> None:
     """A start, and a cube in flight."""
     import imageio.v3 as imageio
 
@@ -216,8 +216,8 @@ def main() -> None:
     choose_renderer()  # MuJoCo asks when it is imported
     if "--measure" in sys.argv:
         measure()
-    if "--stills" in sys.argv:
-        stills()
+    if "--frames" in sys.argv:
+        frames()
     result, page = json.loads(RESULT.read_text()), ROOT / "docs" / "reference" / "flagrun.md"
     insert(page, "episodes", episodes_table(result))
     insert(page, "observations", observations_table(result))

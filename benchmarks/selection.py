@@ -80,8 +80,10 @@ def random_rollout(config: Config, spaces: Spaces) -> Rollout:
     return Rollout(*columns)
 
 
-def one_update(config: Config, spaces: Spaces, on_device: bool = False) -> Callable[[], float]:
-    """A function that runs one update on random samples and returns its CPU seconds."""
+def one_update(
+    config: Config, spaces: Spaces, on_device: bool, clock_of: Callable[[], float]
+) -> Callable[[], float]:
+    """A function that runs one update on random samples and returns its seconds by a clock."""
     policy, rollout = make_policy(config, spaces), random_rollout(config, spaces)
     learner, keys = make_learner(config, policy, spaces), member_keys(0)
     values: dict[str, Any] = {n: np.float32(getattr(config, n)) for n in Hypers._fields}
@@ -99,21 +101,23 @@ def one_update(config: Config, spaces: Spaces, on_device: bool = False) -> Calla
 
     def call() -> float:
         nonlocal state
-        clock = time.process_time()
+        clock = clock_of()
         if on_device:
             state, metrics = inside(state, rollout)
         else:
             state, metrics = learner.learn(state, rollout, batch, hypers, order, key)
         jax.block_until_ready(metrics)
-        return time.process_time() - clock
+        return clock_of() - clock
 
     call()
     return call
 
 
-def measure(name: str, rounds: int, on_device: bool) -> dict[str, Any]:
+def measure(
+    name: str, rounds: int, on_device: bool, clock_of: Callable[[], float]
+) -> dict[str, Any]:
     settings, spaces = CASES[name]
-    calls = {"ppo": one_update(config_of(settings, spaces), spaces, on_device)}
+    calls = {"ppo": one_update(config_of(settings, spaces), spaces, on_device, clock_of)}
     for share in SHARES:
         rule = {
             "sampler": "top-advantage",
@@ -121,7 +125,7 @@ def measure(name: str, rounds: int, on_device: bool) -> dict[str, Any]:
             "normalize_over": "rollout",
         }
         config = config_of(settings, spaces, **rule)
-        calls[str(share)] = one_update(config, spaces, on_device)
+        calls[str(share)] = one_update(config, spaces, on_device, clock_of)
     seconds: dict[str, list[float]] = {label: [] for label in calls}
     for _ in range(rounds):
         for label, call in calls.items():
@@ -155,18 +159,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--only", default="", help="cases whose name contains this")
-    arguments = parser.parse_args()
-    rounds, only = arguments.rounds, arguments.only
-    result: dict[str, Any] = json.loads(PATH.read_text()) if PATH.exists() else {}
-    result["command"] = "python benchmarks/selection.py"
-    cases = {name: partial(measure, name, rounds, False) for name in CASES}
-    cases |= {f"{name}, on the device": partial(measure, name, rounds, True) for name in CASES}
-    cases |= {"Pong, whole training": partial(measure_pong, rounds)}
+    parser.add_argument("--wall", action="store_true", help="time by the wall, as on a GPU")
+    parser.add_argument("--out", type=Path, help=f"default: {PATH.name}; what is there stays")
+    options = parser.parse_args()
+    rounds, path = options.rounds, options.out or PATH
+    clock_of = time.perf_counter if options.wall else time.process_time
+    cases = {name: partial(measure, name, rounds, False, clock_of) for name in CASES}
+    if not options.wall:
+        for name in CASES:
+            cases[f"{name}, on the device"] = partial(measure, name, rounds, True, clock_of)
+        cases["Pong, whole training"] = partial(measure_pong, rounds)
+    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    result["command"] = "python benchmarks/selection.py" + " --wall" * options.wall
     for name, measured in cases.items():
-        if only in name:
+        if options.only in name:
             result[name] = {"rounds": rounds, **measured()}
             print(name, json.dumps(result[name]), flush=True)
-            PATH.write_text(json.dumps(result, indent=1) + "\n")
+            path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

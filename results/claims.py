@@ -160,7 +160,7 @@ def _on(counts: Mapping[str, Count], kind: str) -> str:
     )
 
 
-def told(rows: list[list[str]]) -> list[str]:
+def sentences(rows: list[list[str]]) -> list[str]:
     """A sentence for each claim, from its rows; an arm beside another than the first says which."""
     sentences = []
     for text, of_claim in itertools.groupby(rows, key=lambda row: row[0]):
@@ -218,7 +218,7 @@ def _judged(
         [unversioned(task) for task, c in found.items() if c.kind == kind]
         for kind in ("better", "worse")
     )
-    idle = [
+    inactive = [
         unversioned(task)
         for task, rate in zip(found, keep_rates, strict=True)
         if filters and rate >= UNFILTERED
@@ -229,9 +229,9 @@ def _judged(
     so = _conclusion(better, worse, len(pairs))
     if others:
         so += _over(over)
-    if len(idle) == len(found):
+    if len(inactive) == len(found):
         so += "; it drops next to nothing"
-    elif won := [task for task in better if task in idle]:
+    elif won := [task for task in better if task in inactive]:
         so += f"; it drops next to nothing on {', '.join(won)}"
     low, high = f"{min(keep_rates):.3f}", f"{max(keep_rates):.3f}"
     kept = low if low == high else f"{low} to {high}"

@@ -2,8 +2,8 @@
 
     python results/intervals.py     (two minutes)
 
-Scores are drawn from distributions whose truth is known; told is the share of trials, each with new
-scores, in which the 95% interval holds it.
+Scores are drawn from distributions whose truth is known. The share of trials, each with new scores,
+in which the 95% interval covers the truth is stored.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PATH = Path(__file__).parent / "intervals.json"
 ONE_IN_FIVE, FAR = 0.2, 10.0  # two modes: how many lie in the far one, and where (in std)
 
 
-def held(trial: Callable[[np.random.Generator], bool]) -> float:
+def coverage(trial: Callable[[np.random.Generator], bool]) -> float:
     random = np.random.default_rng(0)
     return sum(trial(random) for _ in range(TRIALS)) / TRIALS
 
@@ -39,7 +39,7 @@ def iqm_of_normals(seeds: int) -> float:
         _, low, high = iqm_estimate([random.normal(size=seeds)])
         return low is not None and high is not None and low <= 0 <= high
 
-    return held(trial)
+    return coverage(trial)
 
 
 def mean_of_two_modes(seeds: int) -> float:
@@ -48,7 +48,7 @@ def mean_of_two_modes(seeds: int) -> float:
         _, low, high = (float(end[0]) for end in mean_interval(values[:, None]))
         return low <= FAR * ONE_IN_FIVE <= high
 
-    return held(trial)
+    return coverage(trial)
 
 
 def improvement_of_normals(seeds: int, apart: float, bootstrap: bool) -> float:
@@ -59,7 +59,7 @@ def improvement_of_normals(seeds: int, apart: float, bootstrap: bool) -> float:
         low, high = bootstrap_improvement([(x, y)]) if bootstrap else improvement_estimate(x, y)[1:]
         return low is not None and high is not None and low <= true <= high
 
-    return held(trial)
+    return coverage(trial)
 
 
 def main() -> None:

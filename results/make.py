@@ -22,6 +22,9 @@ from typing import Any
 
 import numpy as np
 from measured_pages import noise_page, posture_page, sweep_page
+from selection_page import CURVES as SELECTION_CURVES
+from selection_page import POINTS as SELECTION_POINTS
+from selection_page import SELECTION, selection_page
 from studies import MEASURED, ROOT, STUDIES, load, page_of
 from study_pages import pong_text, ppo_page, study_page
 from summary_page import findings, index
@@ -69,7 +72,9 @@ def collect(name: str) -> None:
     spec, size = load_spec(name), json.loads(stored.read_text())["seeds_per_unit"]
     folder = ROOT / "runs" / "units"
     results = gather(spec, units_of(spec, size), folder, f"sauna study {name}")
-    results["cells"] = [cell for cell in map(_thinned, results["cells"]) if cell["members"]]
+    chosen = (SELECTION_CURVES, SELECTION_POINTS) if name in SELECTION else (CURVES, POINTS)
+    cells = [_thinned(cell, *chosen) for cell in results["cells"]]
+    results["cells"] = [cell for cell in cells if cell["members"]]
     if not results["cells"]:
         return
     for cell in results["cells"]:
@@ -78,14 +83,17 @@ def collect(name: str) -> None:
     (ROOT / "results" / f"{name}.json").write_text(text.replace('{"task"', '\n{"task"') + "\n")
 
 
-def _thinned(cell: dict[str, Any]) -> dict[str, Any]:
+def _thinned(cell: dict[str, Any], names: tuple[str, ...], points: int) -> dict[str, Any]:
+    """Keeps the members that have ended, and `points` of some curves of theirs."""
     members = [m for m in cell["members"] if m["status"] in ("complete", "failed")]
     for member in members:
         curve, number = member["curve"], len(member["curve"]["env_steps"])
         chosen = (
-            np.unique(np.linspace(0, number - 1, POINTS).astype(int)).tolist() if number else []
+            np.unique(np.linspace(0, number - 1, points).astype(int)).tolist() if number else []
         )
-        member["curve"] = {key: [curve[key][i] for i in chosen] for key in ("env_steps", *CURVES)}
+        member["curve"] = {
+            key: [curve[key][i] for i in chosen] for key in ("env_steps", *names) if key in curve
+        }
     return {**cell, "members": members}
 
 
@@ -153,6 +161,8 @@ def write_pages() -> None:
         if measured := load(name):
             measured_figures(name, measured)
             (PAGES / page_of(name)).write_text(make(measured))
+    if text := selection_page():
+        (PAGES / "selection.md").write_text(text)
     covered = json.loads((ROOT / "results" / "intervals.json").read_text())["iqm_of_normals"]["6"]
     (PAGES / "index.md").write_text(index(covered))
     insert(ROOT / "README.md", "findings", findings("docs/results/"))
@@ -165,7 +175,7 @@ def write_pages() -> None:
 
 def main() -> None:
     os.chdir(ROOT)
-    for name in STUDIES:
+    for name in (*STUDIES, *SELECTION):
         if "--train" in sys.argv:
             train(name)
         if "--train" in sys.argv or "--collect" in sys.argv:

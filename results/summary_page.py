@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from claims import HEADER, Count, claims_rows, count, short_answer, told
+from claims import HEADER, Count, claims_rows, count, sentences, short_answer
 from measured_pages import noise_answer, posture_answer, sweep_answer
 from studies import (
     CLAIMED,
@@ -132,6 +132,6 @@ def _claims() -> list[str]:
         if rows:
             again = [False, *(row[0] == other[0] for row, other in itertools.pairwise(rows))]
             shown = [["", *row[1:]] if same else row for row, same in zip(rows, again, strict=True)]
-            text = f"{listed(told(rows))}\n\n{markdown([HEADER, *shown])}"
+            text = f"{listed(sentences(rows))}\n\n{markdown([HEADER, *shown])}"
             parts.append(folded(TITLES[name], text))
     return parts

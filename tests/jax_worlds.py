@@ -50,20 +50,22 @@ walk = JaxEnv(reset, step, _BOX, _PUSH)
 
 def make_walk(limit: float = 2.0) -> JaxEnv:
     def near(state: State, action: jax.Array) -> Transition:
-        told = step(state, action)
-        ended = jnp.abs(told.state.x) > limit
-        return told._replace(terminated=ended, truncated=(told.state.steps >= LENGTH) & ~ended)
+        transition = step(state, action)
+        ended = jnp.abs(transition.state.x) > limit
+        return transition._replace(
+            terminated=ended, truncated=(transition.state.steps >= LENGTH) & ~ended
+        )
 
     return walk._replace(step=near)
 
 
 def _always_one(state: State, action: jax.Array) -> Transition:
-    told = step(state, action)
-    return told._replace(
+    transition = step(state, action)
+    return transition._replace(
         observation=jnp.ones(2),
         reward=jnp.float32(1.0),
         terminated=jnp.bool_(False),
-        truncated=told.state.steps >= 2,
+        truncated=transition.state.steps >= 2,
     )
 
 
@@ -74,8 +76,10 @@ cut_off = walk._replace(
 
 
 def _breaks(state: State, action: jax.Array) -> Transition:
-    told = step(state, action)
-    return told._replace(reward=jnp.where(told.state.steps == 5, jnp.nan, told.reward))
+    transition = step(state, action)
+    return transition._replace(
+        reward=jnp.where(transition.state.steps == 5, jnp.nan, transition.reward)
+    )
 
 
 broken = walk._replace(step=_breaks)
@@ -145,18 +149,22 @@ def faulty(fault: str) -> JaxEnv:
     """A beginner's environment."""
 
     def play(state: State, action: jax.Array) -> Transition:
-        told = step(state, action)
+        transition = step(state, action)
         if fault == "raises":
             raise ValueError("two\nlines")
-        if fault == "branches" and told.terminated:
-            return told
+        if fault == "branches" and transition.terminated:
+            return transition
         other = {
             "observation": jnp.zeros(3),
             "reward": jnp.ones(1),
             "terminated": jnp.zeros(2, bool),
         }
-        after = {"state": State(told.state.x, jnp.float32(told.state.steps), told.state.key)}
-        return told._replace(**{k: v for k, v in {**other, **after}.items() if k == fault})
+        after = {
+            "state": State(
+                transition.state.x, jnp.float32(transition.state.steps), transition.state.key
+            )
+        }
+        return transition._replace(**{k: v for k, v in {**other, **after}.items() if k == fault})
 
     return walk._replace(step=play)
 
@@ -166,15 +174,19 @@ def no_env(**kwargs: Any) -> int:
 
 
 # Parts of a user's own with the mistakes that users make.
-misspelt = StepFilter(lambda n, room: (), lambda s, step, k, h: (s, step.vex > h.treshold))
-too_long = StepFilter(lambda n, room: (), lambda s, step, k, h: (s, jnp.append(step.vex, 0.0) > 0))
-forgetting = StepFilter(lambda n, room: jnp.zeros(n), lambda s, step, k, h: (s.sum(), step.vex > 0))
+misspelt = StepFilter(lambda n, capacity: (), lambda s, step, k, h: (s, step.vex > h.treshold))
+too_long = StepFilter(
+    lambda n, capacity: (), lambda s, step, k, h: (s, jnp.append(step.vex, 0.0) > 0)
+)
+forgetting = StepFilter(
+    lambda n, capacity: jnp.zeros(n), lambda s, step, k, h: (s.sum(), step.vex > 0)
+)
 # And without: Python numbers as a state, and numpy where nothing is traced.
 smoothed = StepFilter(
-    lambda n, room: 0, lambda s, step, k, h: (0.9 * s + step.vex.mean(), step.vex >= s)
+    lambda n, capacity: 0, lambda s, step, k, h: (0.9 * s + step.vex.mean(), step.vex >= s)
 )
 by_numpy = StepFilter(
-    lambda n, room: jnp.asarray(np.asarray(jnp.zeros(n))),
+    lambda n, capacity: jnp.asarray(np.asarray(jnp.zeros(n))),
     lambda s, step, k, h: (s + step.vex, step.vex >= s),
 )
 summed = VexTarget(lambda return_, value, weight, episode: jnp.sum(return_ - value))

@@ -210,8 +210,8 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (page,) = (tmp_path / "run").glob("inspect_*.html")
-    told = page.read_text()  # its rule is not eq. 7, and nothing is made up about it
-    assert "The filter is my_filters:lower_half" in told and "inside the band" not in told
+    text = page.read_text()  # its rule is not eq. 7, and nothing is made up about it
+    assert "The filter is my_filters:lower_half" in text and "inside the band" not in text
 
 
 @pytest.mark.parametrize("name", ["smoothed", "by_numpy"])

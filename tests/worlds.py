@@ -113,7 +113,7 @@ class Finite(Endless):
 
 
 class Scripted(World):
-    """Continuous; observations wander with the seed, rewards tell steps apart, odd ends."""
+    """Continuous; observations wander with the seed, every step has another reward, odd ends."""
 
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
@@ -394,8 +394,8 @@ class Lives(World):
         return 5.0 if self.t % 2 == 0 else -3.0
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        told = super().step(action)
-        return *told[:4], {"life_lost": self.t in (2, 4)}
+        result = super().step(action)
+        return *result[:4], {"life_lost": self.t in (2, 4)}
 
 
 class Answering(Scripted):

@@ -55,7 +55,7 @@ def test_a_digest_covers_what_a_module_imports_and_no_more(mine: Path) -> None:
 
 
 def test_packages_count_by_their_version(mine: Path) -> None:
-    assert code_of({"env": "Hopper-v5"}) == {}  # Gymnasium's version is told as before
+    assert code_of({"env": "Hopper-v5"}) == {}  # Gymnasium's version is checked as before
     installed = code_of({"env": "Hopper-v5", "network": "flax.linen:Dense"})
     assert set(installed) == {"flax.linen", "package flax"}
     assert set(code_of({"env": "ALE/Pong-v5"})) == {"package ale-py"}

@@ -229,7 +229,7 @@ def test_a_lost_life_ends_what_is_learned_and_not_what_is_told() -> None:
     np.testing.assert_array_equal(rollout.terminated[:, 0], [False, True] * 6)
     assert not rollout.truncated.any() and not rollout.next_value[1::2].any()
     assert rollout.reward[:, 0].tolist() == [1.0, -1.0] * 6, "signs are learned from"
-    assert [e.return_ for e in episodes] == [6.0, 6.0], "raw rewards of whole games are told"
+    assert [e.return_ for e in episodes] == [6.0, 6.0], "raw rewards of whole games are counted"
     assert [e.length for e in episodes] == [6, 6]
 
 

@@ -60,16 +60,16 @@ def test_a_backend_keeps_the_contract(name: str, kwargs: dict[str, Any], limit: 
     action = jnp.zeros((2, spaces.action_width), spaces.action_dtype)
     first = step(state, action)
     assert equal_trees(step(state, action), first), "the same action, the same step"
-    told, length = first, 1
-    while not bool((told.terminated | told.truncated)[0]):
-        assert shapes(told.state) == shapes(state), "a state of the same shapes for ever"
-        assert shapes(told.observation) == shapes(observation)
-        assert np.isfinite(told.reward).all() and np.isfinite(told.observation).all()
-        told, length = step(told.state, action), length + 1
+    transition, length = first, 1
+    while not bool((transition.terminated | transition.truncated)[0]):
+        assert shapes(transition.state) == shapes(state), "a state of the same shapes for ever"
+        assert shapes(transition.observation) == shapes(observation)
+        assert np.isfinite(transition.reward).all() and np.isfinite(transition.observation).all()
+        transition, length = step(transition.state, action), length + 1
         assert length <= limit
-    assert not bool((told.terminated & told.truncated).any())
+    assert not bool((transition.terminated & transition.truncated).any())
     if length == limit:
-        assert bool(told.truncated[0]), "a time limit is no termination"
+        assert bool(transition.truncated[0]), "a time limit is no termination"
 
 
 def equal_trees(one: Any, other: Any) -> bool:
@@ -102,12 +102,14 @@ def test_mjx_tasks_are_gymnasiums_to_single_precision(name: str, tolerance: floa
     assert ours.action_space == theirs.action_space
     for _ in range(8):
         action = rng.uniform(-1, 1, theirs.action_space.shape).astype(np.float32)
-        told = step(state, action)
+        transition = step(state, action)
         expected = theirs.step(action)
-        np.testing.assert_allclose(told.observation, expected[0], atol=tolerance, rtol=tolerance)
-        np.testing.assert_allclose(told.reward, expected[1], atol=tolerance, rtol=tolerance)
-        assert bool(told.terminated) == expected[2]
-        state = told.state
+        np.testing.assert_allclose(
+            transition.observation, expected[0], atol=tolerance, rtol=tolerance
+        )
+        np.testing.assert_allclose(transition.reward, expected[1], atol=tolerance, rtol=tolerance)
+        assert bool(transition.terminated) == expected[2]
+        state = transition.state
     assert not np.allclose(expected[0], observation, atol=10 * tolerance), "it has moved"
 
 
@@ -136,7 +138,7 @@ def test_a_reset_draws_nothing_that_the_actions_draw() -> None:
     noise = [jax.random.normal(jax.random.fold_in(jax.random.key(7), t)) for t in range(4)]
     assert start not in np.asarray(noise)
     straight = jax.random.normal(jax.random.split(jax.random.key(7))[1])
-    assert straight in np.asarray(noise)  # what it would be without the face's own fold
+    assert straight in np.asarray(noise)  # what it would be without the wrapper's own fold
 
 
 def test_a_missing_backend_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -200,7 +202,7 @@ def test_ten_members_solve_cartpole(arm: str) -> None:
 @slow
 @pytest.mark.parametrize("env", ["playground/CheetahRun", "sauna/HumanoidFlagrunHarder-v0"])
 def test_a_simulated_robot_trains_for_a_few_iterations(env: str, tmp_path: Path) -> None:
-    """As a user would; XLA is told not to optimise, which would take longer than the training."""
+    """As a user would; XLA does not optimise, which would take longer than the training."""
     run = tmp_path / "run"
     command = [
         sys.executable,

@@ -1,4 +1,4 @@
-"""HumanoidFlagrunHarder in Gymnasium and in MJX: one model, one task, two faces."""
+"""HumanoidFlagrunHarder in Gymnasium and in MJX: one model, one task, two interfaces."""
 
 from __future__ import annotations
 

@@ -180,9 +180,9 @@ def test_the_units_of_signs_are_signs(run, found) -> None:
         found.member.config, normalize_rewards=False, sign_rewards=True, dropped="mask"
     )
     changed = found._replace(member=found.member._replace(config=config))
-    told = "".join(meaning(changed))
-    assert "in signs of rewards." in told and "raw units" not in told
-    assert f"A rollout ends after {config.rollout_steps} env steps" in told
+    text = "".join(meaning(changed))
+    assert "in signs of rewards." in text and "raw units" not in text
+    assert f"A rollout ends after {config.rollout_steps} env steps" in text
 
 
 def test_a_run_is_decided_by_its_own_head_and_settings(run, found) -> None:

@@ -37,7 +37,7 @@ def record(world: str = WORLD) -> Recorder:
 
 
 def serve(recorder: Recorder, inbox: Connection, outlet: Connection) -> None:
-    """A worker that sends what was recorded, from where it is told to start."""
+    """A worker that sends what was recorded, from a given message on."""
     outbox = Shared(outlet)
     try:
         header, arrays = receive(inbox)

@@ -86,13 +86,15 @@ def of_the_update() -> float:
         learner = make_learner(job.config, program.policy, job.spaces)
         state = learner.init(key.init)
         limit = np.array([job.config.rollout_steps])
-        (told,) = collector.collect(np.asarray(state.params)[None], [hypers], 0, limit)
+        (collected,) = collector.collect(np.asarray(state.params)[None], [hypers], 0, limit)
         envs.close()
-        batch = learner.make_batch(told.rollout, hypers, key.order)
+        batch = learner.make_batch(collected.rollout, hypers, key.order)
 
         def call() -> None:
             nonlocal state  # used up by each call
-            state, metrics = learner.learn(state, told.rollout, batch, hypers, order, key.order)
+            state, metrics = learner.learn(
+                state, collected.rollout, batch, hypers, order, key.order
+            )
             jax.block_until_ready(metrics)
 
         call()

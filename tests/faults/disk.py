@@ -88,7 +88,7 @@ def _happens(kind: str, path: str) -> bool:
 
 
 class _File:
-    """A file opened for writing; each write is told, and then reaches the file at once."""
+    """A file opened for writing; each write is reported, and then reaches the file at once."""
 
     def __init__(self, file: Any, name: str, hook: Hook) -> None:
         self._file, self._name, self._hook = file, name, hook

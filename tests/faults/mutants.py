@@ -478,7 +478,7 @@ MUTANTS = [
         "algorithm/selection/vex_filter.py",
         "vex_filter coverage",
         (
-            "held rate pushed away",
+            "target keep rate pushed away",
             "(state.kept - rate * number) / SETTLE",
             "(rate * number - state.kept) / SETTLE",
         ),

@@ -158,7 +158,7 @@ def _warm() -> None:
 
 
 class _ForkedWorker:
-    """As much of `subprocess.Popen`'s face as the coordinator needs."""
+    """As much of `subprocess.Popen`'s interface as the coordinator needs."""
 
     def __init__(self, pid: int) -> None:
         self.pid, self.returncode = pid, None
@@ -184,7 +184,7 @@ class _ForkedWorker:
 
 
 def _fork_worker(module: str, environment: dict[str, str]) -> Any:
-    """Stands in for `wire.start_worker`: the same pipes, no new interpreter."""
+    """Stands in for `processes.start_worker`: the same pipes, no new interpreter."""
     from sauna.system.processes import Worker, child_ends
     from sauna.training import worker as served
 

@@ -11,7 +11,7 @@ class Result(NamedTuple):
     Attributes:
       tried: faults that were made.
       lost: after which something that had been saved was gone, or did not end as it must.
-      silent: after which something was wrong without anybody being told.
+      silent: after which something was wrong without a message.
       worst: seconds that the slowest took; each row says of what.
       notes: further counts, by their names.
       failures: of the first few that went wrong, a line each.

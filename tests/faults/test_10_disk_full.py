@@ -23,7 +23,7 @@ ERRORS = (errno.ENOSPC, errno.EROFS, errno.EIO)
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
-    """The operations of a run fail, each with some error; all if there is room, on each backend.
+    """The operations of a run fail, each with some error; all if there is time, on each backend.
 
     `worst`: seconds from the failing operation to the end of the command.
     """
@@ -62,7 +62,7 @@ def _fail(run: Path, world: str, at: int, number: int, expected: Ended, tally: T
     if not isinstance(error, SaunaError) or os.strerror(number) not in str(error):
         tally.miss(f"{what}: ended with {error!r}")
     elif isinstance(error, BadInput) and (run / "config.json").exists():
-        tally.lose(f"{what}: told as bad input: {error}")
+        tally.lose(f"{what}: reported as bad input: {error}")
     _check_kept(run, trap, what, tally)
     try:
         go(run, world)  # there is space again

@@ -1,4 +1,4 @@
-"""Row 11: of several processes that want one run, one gets it; the others are told who has it."""
+"""Row 11: of several processes that want one run, one gets it; the others learn who has it."""
 
 from __future__ import annotations
 
@@ -77,9 +77,9 @@ def _check_told(loser: Process, winner: Process, what: str, tally: Tally) -> Non
     if loser.wait(0.0) != 2:
         tally.lose(f"{what}: a loser ended with {loser.wait(0.0)}: {said[-300:]}")
     elif f"is in use by process {winner.pid}" in said:
-        tally.count("told who holds it")
+        tally.count("named the process that has it")
     elif "is not empty; `sauna resume" in said:
-        tally.count("told that there is a run already")
+        tally.count("refused as there is a run")
     else:
         tally.miss(f"{what}: a loser said {said[-300:]!r}, the winner was {winner.pid}")
 

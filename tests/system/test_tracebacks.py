@@ -37,8 +37,8 @@ def test_only_the_users_frames_are_shown_and_everything_is_described() -> None:
     assert "in raising" in shown and shown.endswith("KeyError: 'one\\ntwo'")
     described = describe_failure(caught.value, in_process=False)
     assert described["frames"] == shown and "in wrapped" in described["traceback"]
-    told = cause_of(described)
-    assert isinstance(told, WorkerTraceback) and user_frames(told) == shown
+    cause = cause_of(described)
+    assert isinstance(cause, WorkerTraceback) and user_frames(cause) == shown
     assert user_frames(SaunaError("no code of a user's")) == ""
     assert user_frames(_of_a_library()) == ""
 

@@ -58,9 +58,9 @@ def free_address() -> str:
 
 
 def finished(process: subprocess.Popen[str]) -> str:
-    told, _ = process.communicate(timeout=500)
-    assert process.returncode == 0, told
-    return told
+    output, _ = process.communicate(timeout=500)
+    assert process.returncode == 0, output
+    return output
 
 
 def assert_same_training(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> None:
@@ -86,9 +86,9 @@ def test_eight_devices_give_what_one_gives(tmp_path: Path) -> None:
 def test_two_machines_train_one_member_together(tmp_path: Path) -> None:
     address = free_address()
     other = start(tmp_path / "none", "--distributed", f"{address},2,1")
-    told = finished(start(tmp_path / "both", "--distributed", f"{address},2,0"))
+    output = finished(start(tmp_path / "both", "--distributed", f"{address},2,0"))
     finished(other)
-    assert "compiled in" in told
+    assert "compiled in" in output
     assert not (tmp_path / "none").exists(), "machine 0 alone writes"
     finished(start(tmp_path / "one"))
     assert_same_training(
@@ -102,8 +102,8 @@ def test_machines_with_other_settings_do_not_train_together(tmp_path: Path) -> N
     other = start(tmp_path / "none", "--distributed", f"{address},2,1", "--checkpoint-every", "3")
     first = start(tmp_path / "both", "--distributed", f"{address},2,0")
     for process in (first, other):
-        told, _ = process.communicate(timeout=500)
-        assert process.returncode in (1, 2) and "different settings" in told
+        output, _ = process.communicate(timeout=500)
+        assert process.returncode in (1, 2) and "different settings" in output
 
 
 def test_only_machine_0_writes_a_run(tmp_path: Path) -> None:

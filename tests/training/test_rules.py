@@ -129,7 +129,7 @@ def test_the_device_learns_what_the_host_learns(arm: str) -> None:
     h, iteration = Hypers(**values), jnp.int32(3)
     setting = Setting(keys, h, jnp.int32(128))
     parts = IterationParts(config, None, policy, make_parts(config, policy, spaces))  # type: ignore[arg-type]
-    device, told = jax.jit(
+    device, arrays = jax.jit(
         lambda state, rollout: learn_from(parts, state, rollout, setting, h, iteration)
     )(learner.init(keys.init), rollout)
     own = jax.random.fold_in(keys.order, iteration)
@@ -143,5 +143,5 @@ def test_the_device_learns_what_the_host_learns(arm: str) -> None:
         named_sampler(device).values(), named_sampler(host).values(), strict=True
     ):
         np.testing.assert_allclose(one, other, rtol=1e-6)
-    for one, other in zip(jax.tree.leaves(told), jax.tree.leaves(said), strict=True):
+    for one, other in zip(jax.tree.leaves(arrays), jax.tree.leaves(said), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)

@@ -107,7 +107,7 @@ def discard(path: Path, made: bool) -> None:
     """Empties the directory of a run that has no row yet, and removes it where the run made it."""
     if any((path / name).exists() for name in LOGS):
         return
-    with contextlib.suppress(OSError):  # what went wrong is told already, and matters more
+    with contextlib.suppress(OSError):  # the first error is reported already, and matters more
         (path / "config.json").unlink(missing_ok=True)
         (path / ".lock").unlink(missing_ok=True)
         if made:

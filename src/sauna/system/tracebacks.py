@@ -51,9 +51,9 @@ def describe_failure(error: BaseException, in_process: bool) -> dict[str, Any]:
 
 def cause_of(failure: Mapping[str, Any]) -> BaseException | None:
     """The exception behind a failure that was described, or its traceback; None: neither."""
-    held = _HELD.pop(failure.get("held", -1), None)
-    if held is not None:
-        return held.__cause__ if isinstance(held, SaunaError) else held
+    kept_error = _HELD.pop(failure.get("held", -1), None)
+    if kept_error is not None:
+        return kept_error.__cause__ if isinstance(kept_error, SaunaError) else kept_error
     if not failure.get("traceback"):
         return None
     return WorkerTraceback(failure["traceback"], failure.get("frames", ""))

@@ -40,14 +40,14 @@ class SteppedHere(HostEnvs):
         return np.asarray(self._running.observation, np.float64)
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
-        self._running, told = self._advance(self._running, action, active)
-        ends = np.asarray(told.terminated), np.asarray(told.truncated)
+        self._running, transition = self._advance(self._running, action, active)
+        ends = np.asarray(transition.terminated), np.asarray(transition.truncated)
         return Step(
             np.asarray(self._running.observation, np.float64),
-            np.asarray(told.reward, np.float64),
+            np.asarray(transition.reward, np.float64),
             *ends,
             np.zeros_like(ends[0]),
-            np.asarray(told.observation, np.float64),
+            np.asarray(transition.observation, np.float64),
             bool((ends[0] | ends[1]).any()),
         )
 
@@ -87,11 +87,13 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
     step = jax.jit(lambda *arguments: collect(parts, *arguments))
     limit = min(100, capacity(config))
     for iteration in range(3):
-        told = host.collect(np.asarray(params)[None], [hypers], iteration, np.array([limit]))[0]
+        collected = host.collect(np.asarray(params)[None], [hypers], iteration, np.array([limit]))[
+            0
+        ]
         state, rollout, ends, faults = step(
             params, state, keys, hypers, jnp.int32(iteration), jnp.int32(limit)
         )
-        expected = told.rollout
+        expected = collected.rollout
         rows = expected.valid.any(1)
         np.testing.assert_array_equal(np.asarray(rollout.valid), expected.valid)
         for name in rollout._fields:
@@ -104,18 +106,18 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
                     got[rows][acted], wanted[rows][acted], rtol=2e-4, atol=2e-5, err_msg=name
                 )
         there = np.asarray(ends.there)
-        assert int(ends.number) == there.sum() == len(told.episodes) > 0
-        np.testing.assert_allclose(ends.return_mean, told.return_mean, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(ends.length_mean, told.length_mean, rtol=1e-5)
-        assert np.isclose(told.length_mean, np.mean([e.length for e in told.episodes]))
+        assert int(ends.number) == there.sum() == len(collected.episodes) > 0
+        np.testing.assert_allclose(ends.return_mean, collected.return_mean, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(ends.length_mean, collected.length_mean, rtol=1e-5)
+        assert np.isclose(collected.length_mean, np.mean([e.length for e in collected.episodes]))
         assert not faults.found
-        for i, episode in zip(np.flatnonzero(there), told.episodes, strict=True):
+        for i, episode in zip(np.flatnonzero(there), collected.episodes, strict=True):
             assert ends.env[i] == episode.env
             assert ends.length[i] == episode.length
             assert ends.truncated[i] == episode.truncated
             assert ends.kept[i] == episode.kept
             np.testing.assert_allclose(ends.return_[i], episode.return_, rtol=1e-4, atol=1e-5)
-    dropped = 1.0 - told.kept_steps / told.env_steps
+    dropped = 1.0 - collected.kept_steps / collected.env_steps
     assert (dropped > 0.05) == (arm != "ppo"), "the filter had something to do"
 
 
@@ -129,16 +131,16 @@ def test_an_ended_episode_keeps_its_last_observation_and_the_next_begins() -> No
     seen_ends = 0
     for _ in range(3 * LENGTH):
         before = running
-        running, told = advance(
+        running, transition = advance(
             env, running, jnp.ones((4, 1)), jnp.array([True, True, True, False]), key, lambda x: x
         )
-        ended = np.asarray(told.terminated | told.truncated)
+        ended = np.asarray(transition.terminated | transition.truncated)
         for n in np.flatnonzero(ended):
             seen_ends += 1
             reached = env.step(_one(before.state, n), jnp.ones(1))
-            np.testing.assert_allclose(told.observation[n], reached.observation, rtol=1e-6)
+            np.testing.assert_allclose(transition.observation[n], reached.observation, rtol=1e-6)
             assert running.episode[n] == before.episode[n] + 1
-            assert running.observation[n, 1] == 0.0 != told.observation[n, 1]
+            assert running.observation[n, 1] == 0.0 != transition.observation[n, 1]
         np.testing.assert_array_equal(running.observation[3], before.observation[3])
     assert seen_ends > 6
 
@@ -149,10 +151,10 @@ def test_cached_resets_return_to_the_first_state_and_fresh_ones_do_not() -> None
         running = first = begin(env, key, 2, cached=cached)
         starts = []
         for _ in range(3 * LENGTH):
-            running, told = advance(
+            running, transition = advance(
                 env, running, jnp.zeros((2, 1)), jnp.ones(2, bool), key, lambda x: x
             )
-            for n in np.flatnonzero(np.asarray(told.terminated | told.truncated)):
+            for n in np.flatnonzero(np.asarray(transition.terminated | transition.truncated)):
                 starts.append(bool((running.observation[n] == first.observation[n]).all()))
         assert starts and all(starts) == cached and any(starts) == cached
 

@@ -218,9 +218,9 @@ def test_the_threshold_that_is_told_would_keep_the_rate() -> None:
     vex = np.random.default_rng(5).normal(0.5, 0.3, (200, 2)).astype(np.float32)
     valid = np.ones(vex.shape, bool)
     valid[150:, 1] = False
-    told = float(threshold_for_rate(jnp.asarray(vex), jnp.asarray(valid), 0.6))
+    threshold = float(threshold_for_rate(jnp.asarray(vex), jnp.asarray(valid), 0.6))
     ratio = np.abs(vex[valid]) / abs(np.median(vex[valid]))
-    assert abs((ratio >= told).mean() - 0.6) < 0.01
+    assert abs((ratio >= threshold).mean() - 0.6) < 0.01
 
 
 def test_a_schedule_is_linear_in_what_is_left() -> None:
@@ -252,8 +252,8 @@ def test_a_schedule_follows_the_env_steps() -> None:
         config = configured(arm="sauna", threshold=0.8, threshold_schedule=schedule, steps=10_000)
         now = hypers_now(config, Counters(env_steps=2_500, kept_steps=9))
         np.testing.assert_allclose(now.threshold, expected, rtol=1e-6)
-        told = moved_threshold(None, now, config)  # type: ignore[arg-type] # no rollout is read
-        np.testing.assert_allclose(told, np.nan if schedule == "constant" else expected, rtol=1e-6)
+        moved = moved_threshold(None, now, config)  # type: ignore[arg-type] # no rollout is read
+        np.testing.assert_allclose(moved, np.nan if schedule == "constant" else expected, rtol=1e-6)
         assert float(now.learning_rate) == np.float32(3e-4 * 0.75)
 
 

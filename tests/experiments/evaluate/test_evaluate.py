@@ -122,9 +122,9 @@ def test_a_failing_video_keeps_the_returns(endless: Path, capsys) -> None:
     flags = ["--episodes", "3", "--max-steps", "9", "--video", "--env-kwargs", '{"breaks": 4}']
     with pytest.raises(SystemExit) as exit:
         cli.main(["eval", str(endless), *flags])
-    told = capsys.readouterr()
-    assert exit.value.code == 1 and "the lamp is broken" in told.err
-    assert "ppo/0: return" in told.out and "3 episodes" in told.out
+    printed = capsys.readouterr()
+    assert exit.value.code == 1 and "the lamp is broken" in printed.err
+    assert "ppo/0: return" in printed.out and "3 episodes" in printed.out
     assert not list((endless / "videos").glob("*part*"))
 
 

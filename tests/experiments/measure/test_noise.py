@@ -123,7 +123,7 @@ def test_estimates_are_unbiased_and_intervals_hold_the_truth(few_resamples: None
     }
     cosine = means[0] @ means[1] / np.sqrt(signal.prod())
     values: dict[str, list[np.ndarray]] = {name: [] for name in [*truth, "alignment"]}
-    held: dict[str, list[bool]] = {name: [] for name in [*truth, "alignment"]}
+    covered: dict[str, list[bool]] = {name: [] for name in [*truth, "alignment"]}
     for _ in range(100):
         found = estimate(drawn(random, means, spread), GROUPS, PAIRS)["groups"]
         for name in values:
@@ -131,13 +131,13 @@ def test_estimates_are_unbiased_and_intervals_hold_the_truth(few_resamples: None
             for group, true in zip(GROUPS, expected, strict=True):
                 value, low, high = found[group][name]
                 values[name].append(np.array([value - true, true]))
-                held[name].append(low <= true <= high)
+                covered[name].append(low <= true <= high)
     for name, pairs in values.items():
         for place in range(2):
             errors = np.array(pairs[place::2])[:, 0]
             if name in ("signal", "variance"):  # others are ratios: unbiased for many streams only
                 assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(len(errors)), name
-            assert np.mean(held[name][place::2]) > 0.85, (name, place)
+            assert np.mean(covered[name][place::2]) > 0.85, (name, place)
 
 
 def test_a_random_control_finds_no_difference_and_a_real_one_is_found(few_resamples: None) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from claims import CLAIMS, HEADER, claims_rows, told
+from claims import CLAIMS, HEADER, claims_rows, sentences
 
 from sauna.experiments.study.tables import PAPER
 
@@ -158,7 +158,7 @@ def test_a_sentence_for_each_claim() -> None:
         [first, "r", "ppo, limits end", "holds"],
         [second, "x", "ppo", "holds"],
     ]
-    assert told(rows) == [
+    assert sentences(rows) == [
         f"**{first}.** `x`, `z`: holds. `y`: not decided. `r` (against `ppo, limits end`): holds.",
         f"**{second}.** `x`: holds.",
     ]

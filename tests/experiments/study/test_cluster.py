@@ -107,7 +107,7 @@ def test_what_runs_on_nodes_imports_neither_jax_nor_environments() -> None:
 
 
 def test_a_task_that_was_replaced_is_not_listened_to() -> None:
-    """A node that was cut off may go on: what it says is dropped, and it is told to stop."""
+    """A node that was cut off may go on: its messages are dropped, and it has to stop."""
 
     async def talk() -> None:
         hub = Hub()

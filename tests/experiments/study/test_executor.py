@@ -108,9 +108,9 @@ def test_a_mark_for_each_seed(tmp_path: Path, capsys) -> None:
     view.progress(units[0], {"rows": [{**ROW, "seed": 0, "env_steps": 5000}]})
     view.ended(units[0]._replace(seeds=(1,)), "out of luck")
     view.refresh()
-    told = capsys.readouterr().out
-    assert f"ppo on A-v0 \u2585{FAILED}{WAITING} return 7.0, keep rate 1.000" in told
-    assert "FAILED: A-v0, ppo, seed 1: out of luck" in told and "25.0% of 6 members" in told
+    printed = capsys.readouterr().out
+    assert f"ppo on A-v0 \u2585{FAILED}{WAITING} return 7.0, keep rate 1.000" in printed
+    assert "FAILED: A-v0, ppo, seed 1: out of luck" in printed and "25.0% of 6 members" in printed
     view.progress(units[0], {"rows": [{**ROW, "seed": 0, "env_steps": 10_000}]})
     assert "33.3%" in view._status()
     view.stopped(units[0])

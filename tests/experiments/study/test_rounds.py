@@ -177,8 +177,8 @@ def test_the_summary_ranks_the_arms_and_says_who_stopped_why(tmp_path: Path) -> 
     assert rows[2]["seeds"] == 3 and "below 0.25" in rows[2]["reason"]
     assert summary == summarize(json.loads((place / "results.json").read_text()))
     assert [v["against"] for v in summary["filtering"]] == ["gigaflow+random"]
-    told = "\n".join(lines(summary))
-    assert "stopped when, why" in told and "at most 5%" in told
+    text = "\n".join(lines(summary))
+    assert "stopped when, why" in text and "at most 5%" in text
     page = (place / "report.html").read_text()
     assert '<section id="ranking">' in page and "Learning curves by samples learned from" in page
 

@@ -235,7 +235,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("compared")
     done = sauna("compare", "worlds:Scripted", "--out", str(out), *FLAGS)
     assert done.returncode == 0, done.stderr
-    (out / "told.txt").write_text(done.stdout)
+    (out / "stdout.txt").write_text(done.stdout)
     return out
 
 
@@ -243,7 +243,7 @@ FLAGS = [*small_flags(seeds=4), "--processes=2"]
 
 
 def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) -> None:
-    told = (compared / "told.txt").read_text()
+    messages = (compared / "stdout.txt").read_text()
     place = next(p for p in compared.iterdir() if p.name.startswith("compare_"))
     results = json.loads((place / "results.json").read_text())
     summary = json.loads((place / "summary.json").read_text())
@@ -256,7 +256,7 @@ def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) ->
         for member in cell["members"]:
             assert 128 - 32 < member["env_steps"] <= 128
             assert member["curve"]["env_steps"][-1] == member["env_steps"]
-    assert "too few seeds" in told and "report:" in told
+    assert "too few seeds" in messages and "report:" in messages
     assert (place / "report.html").read_text().count("too few seeds") >= 3
     assert (place / "figures" / "learning_curves.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -413,20 +413,20 @@ def test_lines_that_are_no_messages_are_passed_over(tmp_path: Path, monkeypatch)
     """Something prints before the unit has taken over its output."""
     (tmp_path / "sitecustomize.py").write_text("print('hello')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    told: list[Any] = []
+    messages: list[Any] = []
     ended = threading.Event()
 
-    def tell(message: Any) -> None:
-        told.append(message)
+    def send(message: Any) -> None:
+        messages.append(message)
         if message is None:
             ended.set()
 
     process = UnitProcess(
-        {"out": str(tmp_path / "run"), "env": "NoSuch-v0"}, tmp_path / "log", tell
+        {"out": str(tmp_path / "run"), "env": "NoSuch-v0"}, tmp_path / "log", send
     )
     assert ended.wait(60)
     assert "exit code 1" in process.end()
-    assert "NoSuch-v0" in told[-2]["error"]
+    assert "NoSuch-v0" in messages[-2]["error"]
 
 
 def test_what_a_run_would_refuse_is_refused_before_anything_is_made(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def update_on_selected(
     if sampler is None or not sampler.each_epoch:
         state, choice = choose(state, batch, choice_key(key), parts=parts)
 
-    def goes_on(carry: tuple[Array, TrainState, Totals]) -> Array:
+    def not_last(carry: tuple[Array, TrainState, Totals]) -> Array:
         return (carry[0] < parts.config.epochs) & ~carry[2].stopped
 
     def epoch(carry: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
@@ -101,7 +101,7 @@ def update_on_selected(
         return e + 1, state, totals
 
     start = (jnp.int32(0), state, _no_totals())
-    _, state, totals = jax.lax.while_loop(goes_on, epoch, start)
+    _, state, totals = jax.lax.while_loop(not_last, epoch, start)
     return state, totals
 
 

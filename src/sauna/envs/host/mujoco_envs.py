@@ -51,7 +51,7 @@ class MujocoEnvs(GymnasiumEnvs):
         self._low, self._high = envs[0].action_space.low, envs[0].action_space.high
         self._clipped = np.zeros((len(envs), len(self._low)), np.float32)
         self._outcome = Outcome(self._observation, self._reward, self._terminated)
-        # The actions of the running episodes `[M, room, A]`, of which `_steps` `[M]` are taken.
+        # The actions of the running episodes `[M, capacity, A]`, of which `_steps` `[M]` are taken.
         self._actions = np.zeros((len(envs), min(limit, CAPACITY), len(self._low)), np.float32)
         self._steps = np.zeros(len(envs), np.int64)
         # Compiles the loops here, where no time limit of a step counts; nobody is active.
@@ -78,7 +78,7 @@ class MujocoEnvs(GymnasiumEnvs):
         return observation
 
     def _make_room(self, steps: int) -> None:
-        """Doubles the room for actions until one more fits behind `steps` of them."""
+        """Doubles the capacity for actions until one more fits behind `steps` of them."""
         while self._actions.shape[1] <= steps:
             self._actions = np.concatenate([self._actions, np.zeros_like(self._actions)], 1)
 

@@ -162,9 +162,9 @@ def fit_axes(axes: Any, lines: Any) -> None:
     if not len(values):
         return
     low, high = values.min(), values.max()
-    room = (high - low) / 3 or abs(high) / 10 or 1.0
+    margin = (high - low) / 3 or abs(high) / 10 or 1.0
     bottom, top = axes.get_ylim()
-    axes.set_ylim(max(bottom, low - room), min(top, high + room))
+    axes.set_ylim(max(bottom, low - margin), min(top, high + margin))
 
 
 def save(figure: Any, path: Path) -> Path:
