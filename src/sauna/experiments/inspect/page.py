@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from sauna.algorithm.rollout.collected import capacity
 from sauna.experiments.inspect.inspection import Inspection, pixel_stride
-from sauna.experiments.inspect.rules import rule_lines, rule_notes, words
+from sauna.experiments.inspect.rules import rule_lines, rule_meaning, rule_notes, words
 from sauna.experiments.report.page import asset, render, rounded
 
 SETTINGS = (
@@ -206,7 +206,7 @@ def _thinned(found: Inspection) -> str:
 def meaning(found: Inspection) -> list[Markup]:
     """Returns what the lines are, and their units; no value comes from a run but numbers."""
     config = found.member.config
-    said = []
+    said = rule_meaning(found)
     if shows_vex(found):
         several = config.filter == "sauna" and config.decision == "joint" and config.envs > 1
         said.append(

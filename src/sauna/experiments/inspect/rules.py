@@ -59,6 +59,22 @@ def rule_notes(found: Inspection) -> list[str]:
     return [*_sampler_notes(found), *_weight_notes(config), *_other_notes(found)]
 
 
+# What a rule's lines are, by name.
+MEANING = {
+    "score": "<b>Score</b>: what the sampler ranks steps by.",
+    "draws": "<b>Draws</b>: how often an epoch draws a step on average.",
+    "weight": "<b>Weight by the sampler</b>: what the step's policy term is multiplied by.",
+    "last_weight": "<b>Weight by the loss</b>: what the step's policy term is multiplied by, before "
+    "the rollout's update and after it. A weight on the mean alone multiplies its gradient.",
+}
+
+
+def rule_meaning(found: Inspection) -> list[str]:
+    """Returns what the lines of the learner's rules are."""
+    lines, _ = rule_lines(found)
+    return [text for name, text in MEANING.items() if name in lines]
+
+
 def _sampler_notes(found: Inspection) -> list[str]:
     config, said = found.member.config, []
     if config.sampler != "none":
