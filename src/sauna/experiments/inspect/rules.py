@@ -64,8 +64,8 @@ MEANING = {
     "score": "<b>Score</b>: what the sampler ranks steps by.",
     "draws": "<b>Draws</b>: how often an epoch draws a step on average.",
     "weight": "<b>Weight by the sampler</b>: what the step's policy term is multiplied by.",
-    "last_weight": "<b>Weight by the loss</b>: what the step's policy term is multiplied by, before "
-    "the rollout's update and after it. A weight on the mean alone multiplies its gradient.",
+    "last_weight": "<b>Weight by the loss</b>: what the step's policy term is multiplied by, "
+    "before the rollout's update and after. A weight on the mean alone multiplies its gradient.",
 }
 
 
