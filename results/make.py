@@ -28,6 +28,7 @@ from selection_page import SELECTION, selection_page
 from studies import MEASURED, ROOT, STUDIES, load, page_of
 from study_pages import pong_text, ppo_page, study_page
 from summary_page import findings, index
+from zoo_page import draw_zoo, zoo_page
 
 from sauna.experiments.report.figures import draw_plots, write_figures
 from sauna.experiments.report.page import rounded
@@ -161,6 +162,9 @@ def write_pages() -> None:
         if measured := load(name):
             measured_figures(name, measured)
             (PAGES / page_of(name)).write_text(make(measured))
+    if zoo := load("zoo"):
+        draw_zoo(zoo["units"], FIGURES / "zoo.svg")
+        (PAGES / "zoo.md").write_text(zoo_page(zoo["units"]))
     if text := selection_page():
         (PAGES / "selection.md").write_text(text)
     covered = json.loads((ROOT / "results" / "intervals.json").read_text())["iqm_of_normals"]["6"]

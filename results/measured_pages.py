@@ -51,30 +51,10 @@ def _listed_and(parts: Iterable[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-NOISE_HEAD = (
-    "Task",
-    "Arm",
-    "Members",
-    "Keep rate",
-    "SNR kept",
-    "SNR control",
-    "SNR dropped",
-    "SNR dropped - control",
-    "SNR dropped - shifted",
-    "SNR per env step, kept - control",
-    "Cosine dropped - control",
-    "Alignment of kept, checkpoints",
-    "Variance, kept / control",
-    "Raw variance, kept / control",
-    "Raw variance, dropped / control",
-    "Raw variance, dropped / shifted",
-)
-
-
 def _full_noise(full: list[list[str]]) -> str:
     """All columns of the report, as rows: there are more measurements than arms."""
     arms = [[row[0], shown_label(row[1]), *row[2:]] for row in full]
-    return markdown([list(row) for row in zip(NOISE_HEAD, *arms, strict=True)])
+    return markdown([list(row) for row in zip(noise_report.HEAD, *arms, strict=True)])
 
 
 def _noise_kinds(row: list[str]) -> tuple[str, str]:

@@ -4,9 +4,11 @@ In CI a test that needs an accelerator (marker `gpu`) may be skipped, and one wh
 `ALLOWED`.
 """
 
+import gc
 import os
 import tempfile
 from collections.abc import Generator
+from contextlib import nullcontext
 
 import pytest
 
@@ -14,8 +16,18 @@ from sauna.system.jax_setup import configure_jax
 
 # Not this user's own key: that of one test session and of the processes that it starts.
 os.environ.setdefault("SAUNA_KEY_FILE", os.path.join(tempfile.mkdtemp(), "key"))
+# Hundreds of programs that compile in a few milliseconds each are kept on disk as well.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 configure_jax()
+
+from shared_programs import forget, share_programs  # noqa: E402
+
+share_programs()  # before a module imports the functions that make them
+
+from threads import trained_here  # noqa: E402
+
+gc.disable()  # while all modules are imported: nothing of that is garbage
 
 ALLOWED = ("one combination is enough",)  # parts of reasons; none is about a tool that is missing
 Report = pytest.TestReport | pytest.CollectReport
@@ -28,6 +40,27 @@ def _fail_if_skipped(report: Report) -> None:
             return
         report.outcome = "failed"
         report.longrepr = f"{path}:{line}: with CI set nothing may be skipped. {reason}"
+
+
+@pytest.fixture
+def fresh_programs() -> Generator[None, None, None]:
+    """For a test that replaces a function which programs are traced from."""
+    forget()
+    yield
+    forget()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what is there now stays: no later collection looks at it
+    gc.enable()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Trains in threads, unless the test is about processes; `tests/faults` chooses for itself."""
+    real = "faults" in item.path.parts or item.get_closest_marker("processes")
+    with nullcontext() if real else trained_here():
+        return (yield)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -51,6 +51,9 @@ class Recorder:
     def allowance(self, iteration: int) -> int:
         return 1_000_000 if self.stop is None else max(self.stop - iteration, 0)
 
+    def stopped(self) -> set[str]:
+        return set()
+
     def iteration(self, iteration: int, rows: list[dict], timing: dict) -> None:
         self.rows += rows
 
@@ -114,3 +117,4 @@ def assert_same_step(one: Step, two: Step) -> None:
     for a, b in zip(one[:4], two[:4], strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])
+    assert one.info == two.info

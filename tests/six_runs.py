@@ -29,7 +29,7 @@ RUNS = {
     "sauna-paper": f"Hopper-v5 --arm sauna-paper {SMALL} --envs 2 --steps 4096",
     "sauna-reference": f"Hopper-v5 --arm sauna-reference {SMALL} --envs 2 --steps 4096",
     "a2c": "InvertedPendulum-v5 --algorithm a2c --arm ppo --seeds 2 --processes 1 --steps 2048",
-    "device": f"gymnax/CartPole-v1 --arm sauna --envs 4 {SMALL} --steps 8192",
+    "device": f"gymnax/CartPole-v1 --preset mujoco --arm sauna --envs 4 {SMALL} --steps 8192",
     "atari": "ALE/Pong-v5 --preset atari --arm sauna --seeds 1 --processes 1 --steps 2048",
 }
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -14,12 +12,13 @@ import numpy as np
 import pytest
 
 import sauna
+from command_line import sauna_here
 from helpers import SMALL, own
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.report.curve import interval, member_curves
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
+from sauna.training.artifact import load_artifact
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
@@ -147,6 +146,7 @@ def test_tensorboard_holds_the_same_numbers(result) -> None:
         np.testing.assert_allclose(found[name], [row[name] for row in rows], rtol=1e-6)
 
 
+@pytest.mark.processes
 def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
     named = sauna.train(Scripted, quiet=True, out=tmp_path / "named", **SMALL)
     assert run_directory.read_config(named.path)["config"]["env"] == "worlds:Scripted"
@@ -200,14 +200,11 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     (tmp_path / "my_filters.py").write_text(code)
     command = next(line for line in text.splitlines() if line.startswith("sauna train"))
     arguments = [*command.split()[1:], "--out", "run", "--steps", "4096", "--seeds", "2"]
-    done = subprocess.run(
-        [sys.executable, "-m", "sauna", *arguments], cwd=tmp_path, capture_output=True, text=True
-    )
+    done = sauna_here(*arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in run_directory.rows(tmp_path / "run")]
     assert min(rates) > 0.2 and max(rates) < 0.95
-    command = [sys.executable, "-m", "sauna", "inspect", "run", "--no-frames"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    done = sauna_here("inspect", "run", "--no-frames", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (page,) = (tmp_path / "run").glob("inspect_*.html")
     text = page.read_text()  # its rule is not eq. 7, and nothing is made up about it

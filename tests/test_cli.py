@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from command_line import sauna, small_flags
+from command_line import sauna, sauna_here, small_flags
 from sauna import cli
 from sauna.config.accepted import translate
 from sauna.config.other_names import ACCEPTED, ADVICE, SAME
@@ -16,6 +16,7 @@ from sauna.config.parsing import many_seeds
 from sauna.config.presets import ARMS, PRESETS, overrides_of, resolve, resolve_run
 from sauna.config.settings import FIELDS, flag, parse, to_json
 from sauna.config.stored import read_stored, stored_config, to_stored
+from sauna.config.task_presets import TASK_PRESETS
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
@@ -33,14 +34,13 @@ BAD = [
     (["train", WORLD, "--minibatches", "33"], "33 does not divide rollout_steps x envs = 2048"),
     (["train", WORLD, "--steps", "-5"], "steps: must be at least 1"),
     (["train", WORLD, "--steps", "100"], "less than one rollout"),
-    (["train", WORLD, "--steps", "1.5"], "steps: cannot read '1.5' as int"),
+    (["train", WORLD, "--steps", "1.5"], "steps: cannot read '1.5' as a whole number"),
     (["train", WORLD, "--seeds", "0"], "seeds: empty"),
     (["train", WORLD, "--seeds", "1,1"], "seed is given twice"),
     (["train", WORLD, "--seeds=-1,2"], "seeds: must lie between"),
     (["train", WORLD, "--gamma", "1.1"], "gamma: must be at most 1"),
     (["train", WORLD, "--gamma", "nan"], "gamma: must be a finite number"),
     (["train", WORLD, "--hidden", ""], "hidden: cannot read"),
-    (["train", WORLD, "--env-kwargs", "[1]"], "env_kwargs: cannot read"),
     (["train", WORLD, "--env-kwargs", '{"a": [0, Infinity]}'], "JSON has no infinity and no NaN"),
     (["train", WORLD, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
     (["train", WORLD, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
@@ -89,9 +89,13 @@ BAD = [
     (["train", WORLD, "--batch-size", "0"], "batch_size: 0 does not divide"),
     (["train", WORLD, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
     (["train", WORLD, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
+    (["train", WORLD, "--seeds", "1.5"], "seeds: cannot read '1.5' as whole numbers, separated by"),
+    (["train", WORLD, "--env-kwargs", "[1]"], "cannot read '[1]' as a JSON object, such as '{"),
+    (["train", WORLD, "--lr-schedule", "x"], "here it is '--learning-rate-schedule'"),
     (["train", WORLD, "--seed", "1,2"], "seed: cannot read '1,2' as a whole number"),
     (["compare", WORLD, "--ent-coef", "0.1"], "here it is '--entropy-coef'"),
-    (["resume", "nothere", "--steps", "9"], "a resumed run computes what it began with"),
+    (["resume", "nothere", "--gamma", "0.9"], "a resumed run computes what it began with"),
+    (["resume", "nothere", "--total-timesteps", "9"], "here it is '--steps'"),
     (["resume", "nothere", "--n-steps", "9"], "a resumed run computes what it began with"),
     (["resume", "nothere", "--procesess", "2"], "did you mean '--processes'?"),
     (["train"], "no environment given"),
@@ -148,6 +152,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
         "checkpoints",
         "config.json",
         "figures",
+        "metrics.csv",
         "metrics.jsonl",
         "summary.json",
         "timing.jsonl",
@@ -155,18 +160,18 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
     assert (run / "figures" / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
     again = sauna("train", WORLD, "--out", str(run), cwd=tmp_path)
     assert again.returncode == 2 and f"sauna resume {run}" in again.stderr
-    assert "nothing to do" in sauna("resume", str(run), cwd=tmp_path).stdout
+    assert "nothing to do" in sauna_here("resume", str(run), cwd=tmp_path).stdout
     for mode in ("sampled", "deterministic"):
         more = ["--deterministic"] if mode == "deterministic" else []
-        done = sauna("eval", str(run), "--episodes", "3", *more, cwd=tmp_path)
+        done = sauna_here("eval", str(run), "--episodes", "3", *more, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         assert f"{mode} actions, frozen normaliser" in done.stdout
         assert "sauna/1: return" in done.stdout and "length" in done.stdout
         stored = json.loads((run / f"evaluation_{mode}.json").read_text())
         assert stored["mode"] == mode and len(stored["members"]["sauna/0"]["returns"]) == 3
-    done = sauna("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
+    done = sauna_here("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
     assert done.returncode == 2 and "did you mean 'sauna/" in done.stderr
-    done = sauna("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
+    done = sauna_here("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
     assert done.returncode == 2 and "other spaces than the run: observation shape" in done.stderr
 
 
@@ -241,6 +246,10 @@ def test_help_shows_what_most_need_first_with_types_and_the_presets_values() -> 
     assert "(default 0.2)" in help_of("train")
     assert "(default 16)" in help_of("train", "--algorithm=a2c")
     assert "--clip-range" in help_of("train", "--preset", "no such")  # is refused later
+    lunar = help_of("train", "LunarLander-v3", "--arm", "sauna")
+    assert "preset lunar-lander" in lunar and "discount (default 0.999)" in lunar
+    own = help_of("train", "my_module:MyEnv", "--arm", "sauna")
+    assert "preset mujoco" in own and "(default sauna)" in own
 
 
 def test_compare_says_its_own_defaults() -> None:
@@ -261,7 +270,7 @@ def test_seed_and_batch_size_replace_what_a_file_says(tmp_path) -> None:
     file = tmp_path / "settings.json"
     file.write_text(json.dumps({"env": WORLD, "seeds": [1, 2], "minibatches": 4}))
     typed = {"seed": "7", "batch_size": "256"}
-    merged = cli._over(cli._overrides_in(str(file), trust=True), typed)
+    merged = translate(cli._over(cli._overrides_in(str(file), trust=True), typed))
     assert merged == {"env": WORLD, "seeds": (7,), "minibatches": 8}
 
 
@@ -386,7 +395,7 @@ def test_presets_are_the_published_numbers() -> None:
         "sign_rewards": False,
     }
     assert {name: getattr(minatar, name) for name in published} == published
-    assert set(PRESETS) == {
+    assert set(PRESETS) - set(TASK_PRESETS) == {
         "mujoco",
         "mujoco-release",
         "flagrun",

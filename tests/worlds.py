@@ -139,6 +139,15 @@ class Scripted(World):
         return self.cut and self.t >= self.end
 
 
+class Informative(Scripted):
+    """Says of every step how far the episode is, and whether that is an even number."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        *step, _ = super().step(action)
+        info = {"is_success": self.t % 2 == 0, "length": np.int64(self.t), "goal": "north"}
+        return *step, {**info, "never": np.nan, "many": np.zeros(2), "nested": {"x": 1.0}}  # type: ignore[return-value]
+
+
 class Drawn(Scripted):
     """The same, and its picture is as bright as its step."""
 

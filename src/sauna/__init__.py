@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any
+
+from sauna.envs.registration import register as _register
 
 if TYPE_CHECKING:
     from sauna.algorithm.learner.vex_targets import VexTarget
@@ -94,5 +95,4 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_HOMES[name]), name)
 
 
-if "gymnasium" in sys.modules:  # as in `gymnasium.make("sauna:sauna/HumanoidFlagrunHarder-v0")`
-    import sauna.envs.flagrun  # noqa: F401 - registers it
+_register()

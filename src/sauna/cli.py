@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | plot | study | ...`.
+"""The command line: `sauna train | resume | eval | inspect | compare | plot | runs | study | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -20,14 +20,8 @@ from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint
 from sauna.config.parsing import whole_number
 from sauna.config.presets import (
-    ARM_HELP,
     COMPARED,
     COMPARED_SEEDS,
-    CONTROL_HELP,
-    FILTER_HELP,
-    PRESET_HELP,
-    RULE_HELP,
-    TARGET_HELP,
     overrides_of,
     parse_all,
 )
@@ -92,7 +86,10 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    add_fields(resume, fields_with("resumable"), {**values, **dict.fromkeys(FIELDS, "")})
+    text = "with more --steps: schedules begin anew over those that are added"
+    resume.add_argument("--restart-schedule", action="store_true", help=text)
+    changeable = (*fields_with("extends_run"), *fields_with("resumable"))
+    add_fields(resume, changeable, {**values, **dict.fromkeys(FIELDS, "")})
 
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
@@ -104,6 +101,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate.add_argument("--env-kwargs", metavar="JSON", help=text)
     text = "the iteration of a kept checkpoint (default: the newest)"
     evaluate.add_argument("--checkpoint", metavar="N", help=text)
+    text = "each member as it was at its best evaluation during training"
+    evaluate.add_argument("--best", action="store_true", help=text)
     evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
@@ -122,13 +121,14 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "leave the frames out: needs no renderer"
     inspect.add_argument("--no-frames", action="store_false", dest="frames", help=text)
 
-    text = "does filtering help on ENV? Trains several arms and says what the data support"
+    text = "does a selection rule help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
     text = f"{FIELDS['env'].metadata['help']}; or runs that exist, as `plot` reads them"
     compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
-    text = f"what to compare; the first is the baseline (default {arms})"
+    text = f"what to compare, also module:name of a rule of your own (default {arms}); the first is"
+    text += " the baseline"
     compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
     text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
     compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
@@ -152,9 +152,15 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
 
     text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
     plot = commands.add_parser("plot", help=text, allow_abbrev=False)
-    plot.add_argument("runs", nargs="+", metavar="RUN")
+    text = "a run directory, a CSV file (seed, step, return), or TensorBoard files or their folder"
+    plot.add_argument("runs", nargs="+", metavar="RUN", help=text)
     plot.add_argument("--out", default="", metavar="FILE", help="the figure, .png or .svg")
     plot.add_argument("--tag", default="", help="of the returns in TensorBoard files")
+
+    text = "what runs a folder holds, how far each is and how it went"
+    runs = commands.add_parser("runs", help=text, allow_abbrev=False)
+    text = "the folder, searched with those below (default runs)"
+    runs.add_argument("folder", nargs="?", metavar="DIR", default="runs", help=text)
 
     text = "measure this machine: training, its parts, physics alone, other trainers"
     bench = commands.add_parser("bench", help=text, usage=usage % "bench", allow_abbrev=False)
@@ -239,24 +245,30 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.api import train_and_draw
     from sauna.training import run as runs
     from sauna.training.display import make_display
+    from sauna.training.pick import pick
 
-    stored = _overrides_in(values.pop("config"), values.pop("trust"))
+    trust = values.pop("trust")
+    stored = _overrides_in(values.pop("config"), trust)
     env = values.pop("env")
-    overrides = _over(stored, values | ({"env": env} if env else {}))
+    picked = pick(_over(stored, values | ({"env": env} if env else {})))
+    overrides = translate(picked.overrides)
     display = make_display()
     if runs.follows(overrides):
         runs.follow(overrides, display)
         return
-    run = runs.start(overrides, display)
+    run = runs.start(overrides, display, picked.found, trust)
+    if picked.said:
+        display.say(picked.said)
     train_and_draw(run, display, resume=False)
-    print(f"learning curve: {run.path}/figures/learning_curve.png")
+    curve = run.path / "figures" / "learning_curve.png"
+    print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
-    """Puts what is typed over what a file says; `--seed` and `--batch-size` count as typed."""
+    """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
     replaced = {"seed": "seeds", "batch_size": "minibatches"}
     gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
-    return translate({k: v for k, v in stored.items() if k not in gone} | typed)
+    return {k: v for k, v in stored.items() if k not in gone} | typed
 
 
 def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
@@ -277,7 +289,8 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
 
     path = Path(values.pop("run"))
-    inexact, *how = (values.pop(name) for name in ("inexact", "trust", "accept_changed_code"))
+    names = ("inexact", "trust", "accept_changed_code", "restart_schedule")
+    inexact, *how = (values.pop(name) for name in names)
     display = make_display()
     run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)
@@ -334,7 +347,8 @@ def _compare(values: dict[str, Any]) -> None:
     if not env:
         raise BadInput("env: no environment given; try `sauna compare InvertedPendulum-v5`")
     place = {name: values.pop(name) for name in _PLACE}
-    values = translate(values)
+    values = translate({"env": env, **values})
+    del values["env"]
     parsed = parse_all(values)
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(env, chosen, parsed, is_tournament)
@@ -347,12 +361,19 @@ def _plot(values: dict[str, Any]) -> None:
     print(f"figure: {plot([*map(Path, values['runs'])], values['out'], values['tag'])}")
 
 
+def _runs(values: dict[str, Any]) -> None:
+    from sauna.experiments.run_list import list_runs
+
+    print("\n".join(list_runs(Path(values["folder"]))))
+
+
 def _study(values: dict[str, Any]) -> None:
+    from sauna.config.trust import named_code
     from sauna.experiments.study.command import check_study, load_spec, study_command
 
     name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
     spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
-    _run_study(spec, study_command(name, out), **values)
+    _run_study(spec, study_command(name, out, bool(named_code(spec.text))), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:
@@ -380,46 +401,10 @@ def _say(text: str) -> None:
 
 
 def _list(values: dict[str, Any]) -> None:
-    what = values["what"]
-    if what == "envs":
-        import gymnasium
+    from sauna.experiments.listing import listing
 
-        import sauna.envs.flagrun  # noqa: F401 - registers it
-
-        for name in sorted(gymnasium.registry):
-            print(name)
-        for backend in NATIVE:
-            print(f"{backend}/...  (on the device; `sauna list {backend}` names them)")
-        print("ALE/...  (`sauna list atari` names them)")
-    elif what == "atari":
-        from sauna.envs.host.atari_envs import names
-
-        print("\n".join(names()))
-    elif what in NATIVE:
-        from sauna.envs.device.make import names_of
-
-        for name in names_of(what):
-            print(name)
-    elif what == "rules":
-        for name, text in {**RULE_HELP, **CONTROL_HELP}.items():
-            stage, _, sentence = text.partition(": ")
-            print(f"{name:15} {stage:8} {sentence}")
-        print("\nJoin rules by +, such as sauna+avec, and a control to a rule: gigaflow+random")
-    elif what == "studies":
-        from sauna.experiments.study.spec import built_in
-
-        for name, text in built_in().items():
-            print(f"{name:10} {text.splitlines()[0].removeprefix('# ')}")
-    else:
-        known = {
-            "arms": ARM_HELP,
-            "presets": PRESET_HELP,
-            "filters": FILTER_HELP,
-            "targets": TARGET_HELP,
-        }[what]
-        width = max(map(len, known))
-        for name, text in known.items():
-            print(f"{name:{width}}  {text}")
+    for line in listing(values["what"]):
+        print(line)
 
 
 _COMMANDS = {
@@ -429,6 +414,7 @@ _COMMANDS = {
     "inspect": _inspect,
     "compare": _compare,
     "plot": _plot,
+    "runs": _runs,
     "study": _study,
     "bench": _bench,
     "list": _list,

@@ -15,13 +15,14 @@ from sauna.system.errors import BadInput
 
 WORLD = "worlds:Scripted"
 ARMS = [
-    ("ppo", {}),
     ("sauna-reference", {"threshold": 0.6}),
+    pytest.param("ppo", {}, marks=pytest.mark.slow),
     pytest.param("sauna", {"threshold": 0.9}, marks=pytest.mark.slow),
     pytest.param("random-drop", {"drop_rate": 0.3}, marks=pytest.mark.slow),
 ]
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("arm, settings", ARMS)
 def test_member_3_alone_among_six_and_in_another_process(arm, settings, tmp_path) -> None:
     common = {"arm": arm, "envs": 2, "steps": 256, **settings}

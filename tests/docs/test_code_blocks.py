@@ -24,6 +24,7 @@ import pytest
 from sauna import cli
 from sauna.config.presets import PRESETS, parse_all, resolve
 from sauna.config.settings import FIELDS
+from sauna.config.zoo import entry_of
 from sauna.envs.make import make_env
 from sauna.experiments.study.command import chosen_arms, comparison
 
@@ -33,7 +34,7 @@ FENCE = re.compile(r"^```(\w*)[ ]?([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTAL
 LANGUAGES = {"bash", "python", "toml", "text"}
 # Commands that are parsed but not run: they need games, a cluster, a browser or hours.
 NOT_RUN = re.compile(
-    r"ALE/|playground/|Flagrun|--distributed|--on ray|^sauna (study|bench|list)|--v"
+    r"ALE/|playground/|Flagrun|LunarLander|--distributed|--on ray|^sauna (study|bench|list)|--v"
     r"|compare (?!InvertedPendulum)|plot runs/ppo"
 )
 EXAMPLE_MODULE = """
@@ -242,10 +243,9 @@ def toy(arguments: list[str]) -> list[str]:
     parsed, _ = cli.make_parser().parse_known_args(arguments)
     if parsed.command in ("train", "compare"):
         values = vars(parsed)
-        start = {
-            **{n: f.default for n, f in FIELDS.items()},
-            **PRESETS[values.get("preset", "mujoco")],
-        }
+        entry = entry_of(values["env"] or "") if parsed.command == "train" else None
+        preset = values.get("preset", entry.preset if entry else "mujoco")
+        start = {**{n: f.default for n, f in FIELDS.items()}, **PRESETS[preset]}
         rollout = int(values.get("rollout_steps", start["rollout_steps"]))
         rollout *= int(values.get("envs", start["envs"]))
         return [*arguments, "--steps", str(2 * rollout), "--seeds", "2"]

@@ -163,19 +163,40 @@ def test_a_close_that_raises_does_not_lose_a_training(tmp_path: Path) -> None:
         assert sum(row["env_steps"] for row in run.metrics) >= 96
 
 
-REGISTERED = "import gymnasium; print(type(gymnasium.make({!r}).unwrapped).__name__)"
+FLAGRUN = "sauna/HumanoidFlagrunHarder-v0"
+MAKE = "print(type(gymnasium.make({!r}).unwrapped).__name__)"
 
 
-def test_flagrun_is_known_to_any_program_at_no_cost() -> None:
-    name = "sauna/HumanoidFlagrunHarder-v0"
-    for code in (
-        REGISTERED.format(f"sauna:{name}"),
-        "import gymnasium, sauna;" + REGISTERED.format(name),
-    ):
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        assert done.stdout.strip() == "HumanoidFlagrunHarder", done.stderr
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import gymnasium; " + MAKE.format(f"sauna:{FLAGRUN}"),
+        "import gymnasium, sauna; " + MAKE.format(FLAGRUN),
+        "import sauna, gymnasium; " + MAKE.format(FLAGRUN),
+        "import sauna, gymnasium; " + MAKE.format(f"sauna:{FLAGRUN}"),
+        # Looking for a package is not importing it; an import of a part is.
+        "import sauna, importlib.util; importlib.util.find_spec('gymnasium'); "
+        "import gymnasium.spaces; import gymnasium; " + MAKE.format(FLAGRUN),
+    ],
+)
+def test_flagrun_is_known_to_any_program_in_any_order_of_imports(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "HumanoidFlagrunHarder", done.stderr
+
+
+def test_registering_costs_nothing_without_gymnasium() -> None:
     code = (
         "import sys, sauna; print([m for m in ('gymnasium', 'jax', 'numpy') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_finder_is_there_once_and_goes_when_gymnasium_came() -> None:
+    code = (
+        "import sys, sauna; from sauna.envs.registration import register; register(); "
+        "count = lambda: sum(type(f).__name__ == '_AfterGymnasium' for f in sys.meta_path); "
+        "before = count(); import gymnasium; print(before, count())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["1", "0"], done.stderr

@@ -63,6 +63,7 @@ def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
         assert one.ended == two.ended == ended.any()
         for a, b in zip(one[:4], two[:4], strict=True):
             assert a[active].tobytes() == b[active].tobytes(), f"step {t}"
+        assert one.info == two.info and set(one.info) == set(np.flatnonzero(ended)), f"step {t}"
         np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])
         ends += ended.sum()
     assert ends >= 3 if kwargs == {} else ends >= 1

@@ -25,7 +25,6 @@ from sauna.algorithm.rollout.program import decide as decide_segment
 from sauna.algorithm.selection.registry import make_filter
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep
 from sauna.config.settings import Config
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import advantages, decide
 from sauna.experiments.inspect.inspection import (
@@ -38,6 +37,7 @@ from sauna.experiments.inspect.page import meaning
 from sauna.experiments.inspect.recording import MAX_FRAMES, SIDE, Frames, Recorder, _played
 from sauna.experiments.inspect.streams import scaled, stream_of
 from sauna.system.errors import BadInput
+from sauna.training.artifact import load_artifact
 from worlds import Drawn, Lives, Scripted
 
 THRESHOLD = 0.9
@@ -342,7 +342,8 @@ def test_bad_input_creates_nothing(run, tmp_path) -> None:
 @pytest.mark.slow
 def test_runs_of_the_device_and_of_pictures_are_inspected(tmp_path) -> None:
     for env, more in (("gymnax/CartPole-v1", {}), ("worlds:Picture", {"network": "nature-cnn"})):
-        settings = {**SMALL, "arm": "sauna", "out": tmp_path / env.replace("/", "-"), **more}
+        settings = {**SMALL, "preset": "mujoco", "arm": "sauna", **more}
+        settings["out"] = tmp_path / env.replace("/", "-")
         if more:
             del settings["hidden"]
         path = sauna.train(env, quiet=True, **settings).path

@@ -20,7 +20,6 @@ from faults.disk import Crash, Hook, Op, watched
 from helpers import SMALL, Recorder, equal, make_job, train_here
 from sauna.system import checkpoint, run_directory
 from sauna.system.processes import Shared, Worker, receive, send, start_thread
-from sauna.training import worker
 from sauna.training.worker import PipeReporter
 
 WORLD = "worlds:Scripted"
@@ -73,16 +72,6 @@ def played_back(recorder: Recorder) -> Iterator[None]:
         patch("sauna.system.run_directory.git_revision", lambda: None),
         patch("sauna.system.run_directory.machine", dict),
         patch("os.fsync", lambda descriptor: None),
-    ):
-        yield
-
-
-@contextmanager
-def trained_here() -> Iterator[None]:
-    """Runs train in threads of this process, which has imported JAX already."""
-    target = partial(worker.serve, dies_alone=False)
-    with patch(
-        "sauna.training.coordinator.start_worker", lambda module, environment: start_thread(target)
     ):
         yield
 

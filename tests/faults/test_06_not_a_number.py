@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import trained_here
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
 from jax_worlds import FIELDS, Poison, poisoned
@@ -30,7 +29,7 @@ from sauna.envs.make import env_maker
 from sauna.envs.workers import ProcessEnvs
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import SaunaError
-from sauna.training.loop.device import _check_sound, _setting
+from sauna.training.loop.device import _check_finite, _setting
 from sauna.training.loop.device_program import (
     MemberState,
     Parts,
@@ -40,6 +39,7 @@ from sauna.training.loop.device_program import (
     make_iteration,
     several,
 )
+from threads import trained_here
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 VALUES = ("nan", "inf", "-inf")
@@ -208,7 +208,7 @@ class OnDevice:
         message = "it got through"
         for i in np.flatnonzero(reports.ran):
             try:
-                _check_sound(self._member, i, jax.tree.map(lambda x: x[i], reports))  # noqa: B023
+                _check_finite(self._member, i, jax.tree.map(lambda x: x[i], reports))  # noqa: B023
             except SaunaError as error:
                 message = str(error)
         if message != wanted:

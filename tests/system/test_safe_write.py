@@ -124,3 +124,23 @@ def test_a_planted_run_does_not_write_elsewhere(tmp_path: Path, precious: Path) 
     with pytest.raises(SaunaError):
         sauna.resume(run, quiet=True)
     assert precious.read_bytes() == PRECIOUS
+
+
+def test_folders_are_made_here_or_where_the_user_said() -> None:
+    """Whatever else makes a folder could make it behind a link of somebody else's."""
+    source = Path(sauna.__file__).parent
+    makers = {p.relative_to(source).as_posix() for p in source.rglob("*.py") if _makes(p)}
+    assert makers <= {
+        "system/safe_write.py",
+        "system/checkpoint.py",  # a temporary name that cannot be guessed
+        "system/run_directory.py",  # --out
+        "config/trust.py",  # the folder of this user's key
+        "experiments/study/command.py",  # --out
+        "experiments/study/existing.py",
+        "experiments/study/report.py",
+        "experiments/study/execute/ray_files.py",  # inside a unit that this study locked
+    }
+
+
+def _makes(path: Path) -> bool:
+    return ".mkdir(" in path.read_text() or "makedirs(" in path.read_text()

@@ -60,6 +60,7 @@ def test_an_exception_of_this_process_is_the_cause_itself() -> None:
     assert isinstance(cause_of(described), WorkerTraceback)  # taken once
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("env_processes", [0, 1])
 def test_a_worker_that_fails_leaves_its_traceback(tmp_path: Path, env_processes: int) -> None:
     run = tmp_path / "run"

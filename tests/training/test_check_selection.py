@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
 import sauna
-from helpers import SMALL, configured, environment
+from command_line import sauna_here
+from helpers import SMALL, configured
 from sauna.algorithm.selection.registry import make_filter
 from sauna.config.arms import ARMS, arm_settings, fixed_by
 from sauna.config.presets import resolve
@@ -124,13 +123,7 @@ def test_a_mistake_ends_with_2_and_creates_nothing(tmp_path) -> None:
         ["--sampler", "kondo", "--sampler-kwargs", '{"share": 7}'],
     )
     for mistake in mistakes:
-        run = subprocess.run(
-            [sys.executable, "-m", "sauna", "train", *command, *mistake, "--out", "run"],
-            cwd=tmp_path,
-            env=environment(),
-            capture_output=True,
-            text=True,
-        )
+        run = sauna_here("train", *command, *mistake, "--out", "run", cwd=tmp_path)
         assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
         assert list(tmp_path.iterdir()) == []
 
@@ -196,6 +189,7 @@ MISTAKEN = [
     ({"arm": "sauna,sauna+avec"}, "sauna+avec differs from the other arms in"),
     ({"arm": "gigaflow+random+avec+spo+pods"}, "joins sampler gigaflow and sampler pods"),
     ({"arm": "gigaflow+pods"}, "joins sampler gigaflow and sampler pods"),
+    ({"arm": "gigaflow+avec+gigaflow"}, "joins a rule to itself"),
     ({"arm": "gigafow"}, "did you mean 'gigaflow'"),
     ({"sampler": "kondu"}, "did you mean 'kondo'"),
     ({"arm": "pods", "sampler_kwargs": '{"share": Infinity}'}, "JSON has no infinity"),

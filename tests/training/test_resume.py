@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 from pathlib import Path
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import trained_here
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna.config import presets
 from sauna.experiments.measure.streams import load_snapshot
@@ -101,7 +101,7 @@ def finished(tmp_path: Path, **settings) -> Path:
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys) -> None:
     run = finished(tmp_path)
-    expected = (run / "metrics.jsonl").read_bytes()
+    expected, table = (run / "metrics.jsonl").read_bytes(), timeless_table(run)
     (run / "summary.json").unlink()
     newest = checkpoint.numbered(run / "checkpoints")[-1]
     good = (newest / "state.safetensors").read_bytes()
@@ -115,6 +115,17 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys)
     assert (kept / "state.safetensors").read_bytes() == bytes(blob)
     assert (newest / "state.safetensors").read_bytes() == good
     assert (run / "metrics.jsonl").read_bytes() == expected
+    assert timeless_table(run) == table and len(table) > 2
+    seconds = [row["wall_seconds"] for row in run_directory.rows(run, "timing.jsonl")]
+    assert seconds == sorted(seconds)
+
+
+def timeless_table(run: Path) -> list[list[str]]:
+    """`metrics.csv` without the clock's column."""
+    with (run / "metrics.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    clock = rows[0].index("wall_seconds")
+    return [row[:clock] + row[clock + 1 :] for row in rows]
 
 
 def test_a_damaged_newer_checkpoint_takes_no_place_of_a_good_one(tmp_path) -> None:
@@ -140,8 +151,7 @@ def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch) -> Non
     assert {(m.config.learning_rate, m.config.gae_lambda) for m in opened.members} == {(3e-4, 0.95)}
     snapshot = load_snapshot(run, opened.members[0].name, 2)
     assert float(snapshot.hypers.gae_lambda) == np.float32(0.95)
-    with trained_here():  # under the other presets
-        sauna.resume(run, quiet=True)
+    sauna.resume(run, quiet=True)  # in this process, under the other presets
     assert (run / "metrics.jsonl").read_bytes() == expected
 
 

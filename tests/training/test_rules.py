@@ -61,6 +61,7 @@ def test_an_arm_trains_and_its_work_is_told(arm: str, place: str) -> None:
             np.testing.assert_allclose([row["sample_rate"] for row in recorder.rows], expected)
 
 
+@pytest.mark.usefixtures("fresh_programs")
 @pytest.mark.parametrize("dropped", ["replace", pytest.param("mask", marks=slow)])
 @pytest.mark.parametrize("place", ["host", "device"])
 def test_a_control_keeps_as_many_steps_of_each_env_as_its_rule(

@@ -99,6 +99,8 @@ def arm_settings(arm: str) -> dict[str, Any]:
       BadInput: an unknown name (naming the nearest), or two parts that want different things.
     """
     first, *others = arm.split("+")
+    if len({first, *others}) <= len(others):
+        raise BadInput(f"arm: {arm} joins a rule to itself")
     settings = dict(_part(first))
     changed = {name for name, value in settings.items() if ARMS["ppo"].get(name) != value}
     for part in others:

@@ -11,6 +11,7 @@ from typing import Any
 from sauna.config.fields import GROUPS
 from sauna.config.presets import arm_config
 from sauna.config.settings import FIELDS, TYPES, Config, flag
+from sauna.config.zoo import AUTO, entry_of
 from sauna.system.errors import BadInput
 
 FIRST = "most needed"
@@ -50,8 +51,11 @@ def _title(name: str) -> str:
 def _add_field(group: Any, name: str, value: Any) -> None:
     text = FIELDS[name].metadata["help"]
     shown = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    shown = "none" if value is None else shown
     if name == "seeds" and value == (0,):
         shown = "1: seed 0"
+    if name == "preset":
+        shown = ""  # its text says what is taken
     text += f" (default {shown})" if shown else ""
     how: dict[str, Any] = {"metavar": metavar(name)}
     if TYPES[name] is bool:
@@ -80,11 +84,11 @@ def metavar(name: str) -> str:
     if typing.get_origin(field_type) is tuple:
         item = typing.get_args(field_type)[0]
         return "NAME,..." if item is str else "INT,..."
-    return {int: "INT", float: "FLOAT"}.get(field_type, "TEXT")
+    return {int: "INT", float: "FLOAT", float | None: "FLOAT"}.get(field_type, "TEXT")
 
 
 def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, Any]:
-    """Finds the defaults that hold for a command line: those of the arm and preset it names.
+    """Finds the defaults that hold for a command line: of the arm, preset or environment it names.
 
     Args:
       arguments: all of them; what is wrong in them is found later.
@@ -93,9 +97,15 @@ def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, 
     reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("--arm", "--preset", "--algorithm"):
         reader.add_argument(name)
+    for name in ("command", "env"):
+        reader.add_argument(name, nargs="?")
     try:
         named, _ = reader.parse_known_args(list(arguments))
-        preset = {n: v for n, v in vars(named).items() if v is not None and n != "arm"}
+        own = ("preset", "algorithm")
+        preset = {n: v for n in own if (v := getattr(named, n)) is not None}
+        known = named.command == "train" and entry_of(named.env or "") is not None
+        if known and "preset" not in preset:
+            preset |= {"env": named.env, "preset": AUTO}
         first = arm or str(named.arm or Config.arm[0]).split(",")[0]
         config = arm_config(first, preset)
     except (argparse.ArgumentError, BadInput):

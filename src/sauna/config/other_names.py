@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sauna.config.settings import FIELDS, flag
+from sauna.config.settings import FIELDS, fields_with, flag
 from sauna.system.errors import nearest
 
 SAME = {
@@ -33,6 +33,7 @@ SAME = {
     "num_learning_epochs": "epochs",
     "num_updates_per_batch": "epochs",
     "lr": "learning_rate",
+    "lr_schedule": "learning_rate_schedule",
     "anneal_lr": "learning_rate_schedule",
     "schedule": "learning_rate_schedule",
     "clip_coef": "clip_range",
@@ -48,6 +49,8 @@ SAME = {
     "vf_coef": "value_coef",
     "value_loss_coef": "value_coef",
     "discounting": "gamma",
+    "discount": "gamma",
+    "discount_factor": "gamma",
     "lam": "gae_lambda",
     "rms_prop_eps": "rmsprop_epsilon",
     "use_rms_prop": "optimizer",
@@ -59,7 +62,10 @@ SAME = {
     "init_noise_std": "log_std_init",
     "norm_obs": "normalize_observations",
     "empirical_normalization": "normalize_observations",
+    "normalize_obs": "normalize_observations",
+    "vec_normalize": "normalize_observations",
     "norm_reward": "normalize_rewards",
+    "normalize_reward": "normalize_rewards",
     "reward_scaling": "normalize_rewards",
     "clip_obs": "clip_observations",
     "clip_reward": "clip_rewards",
@@ -74,6 +80,12 @@ SAME = {
     "experiment_name": "out",
     "run_name": "out",
     "log_dir": "out",
+    "eval_freq": "eval_every",
+    "evaluation_frequency": "eval_every",
+    "n_eval_episodes": "eval_episodes",
+    "num_eval_episodes": "eval_episodes",
+    "reward_threshold": "stop_at",
+    "max_no_improvement_evals": "stop_when_flat",
     "cuda": "device",
     "n_seeds": "seeds",
 }
@@ -84,6 +96,7 @@ ADVICE = {
     "num_iterations": "give steps: iterations x envs x rollout_steps",
     "capture_video": "`sauna eval RUN --video` records a trained policy",
     "torch_deterministic": "a run repeats itself to the bit by itself",
+    "log_interval": "every iteration has its rows in metrics.jsonl and metrics.csv",
     "verbose": "`quiet=True` in Python shows nothing",
     "use_sde": "there is no state-dependent exploration here",
     "policy": "the policy follows from the spaces; `network` chooses its trunk",
@@ -105,7 +118,9 @@ def flag_hint(argument: str, known: list[str], command: str | None) -> str:
     """
     typed = argument.split("=")[0]
     name = typed.lstrip("-").removeprefix("no-").replace("-", "_")
-    if command == "resume" and SAME.get(name, name) in (*FIELDS, *ACCEPTED):
+    ours = SAME.get(name, name)
+    changeable = (*fields_with("extends_run"), *fields_with("resumable"))
+    if command == "resume" and ours in (*FIELDS, *ACCEPTED) and ours not in changeable:
         return (
             "; a resumed run computes what it began with: "
             "`sauna train --config RUN/config.json` trains anew with other settings"

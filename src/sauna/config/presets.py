@@ -1,6 +1,6 @@
 """Named settings: presets, arms (which selection method), and how a run's config is resolved.
 
-A preset says how an algorithm trains; an arm says which transitions the update keeps. METHOD, in
+A preset says how an algorithm trains; an arm says which rules a run trains with. METHOD, in
 `docs/concepts/ppo.md`, gives the origin of every number.
 """
 
@@ -22,6 +22,8 @@ from sauna.config.arms import RULE_HELP as RULE_HELP
 from sauna.config.checks import check_consistent, check_read, is_read
 from sauna.config.other_names import key_hint
 from sauna.config.settings import FIELDS, Config, fields_with, parse
+from sauna.config.task_presets import TASK_PRESET_HELP, TASK_PRESETS
+from sauna.config.zoo import AUTO, MUJOCO, entry_for
 from sauna.system.errors import BadInput, nearest
 
 # Schulman et al. (2017) and OpenAI baselines' defaults for MuJoCo are `Config`'s own defaults.
@@ -79,13 +81,13 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 PRESETS["a2c-atari"] = {**PRESETS["a2c"], "sign_rewards": True, "normalize_rewards": False}
 PRESETS["a2c-mujoco"] = {**PRESETS["a2c"], "entropy_coef": 0.0, "trunk": "separate"}
+PRESETS |= TASK_PRESETS
 
 # Tasks with published results: MuJoCo's actions stay in the robot's own units, as there, if nobody
 # says otherwise (the other tasks here have boxes of [-1, 1], or no boxes).
 PUBLISHED = re.compile(
     r"^(?:ALE|sauna|mjx|brax|playground)/|^gymnax/.*-MinAtar$|"
-    r"^(?:[\w.]+:)?(?:Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum|"
-    r"InvertedPendulum|Pusher|Reacher|Swimmer|Walker2d)-v\d+$"
+    rf"^(?:[\w.]+:)?(?:{MUJOCO})-v\d+$"
 )
 # What was done before a field existed, if that is not its default.
 BEFORE = {"rescale_actions": False}
@@ -102,6 +104,7 @@ PRESET_HELP = {
     "a2c": "A2C's numbers as published (Mnih et al. 2016, baselines): 16 actors, 5 steps each",
     "a2c-atari": "the same on Atari: signs of rewards, none of them normalised",
     "a2c-mujoco": "the same for continuous control: separate trunks, no entropy bonus",
+    **TASK_PRESET_HELP,
 }
 
 FILTER_HELP = {
@@ -210,11 +213,17 @@ def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
 def chosen_preset(parsed: Mapping[str, Any]) -> str:
     """Names the preset that is given, or the first one of the algorithm.
 
+    `auto` is the environment's, with A2C the first one.
+
     Raises:
-      BadInput: there is no such preset, or it is another algorithm's than the one named.
+      BadInput: there is no such preset, it is another algorithm's than the one named, or `auto`
+        knows nothing of the environment.
     """
     algorithm = parsed.get("algorithm")
-    preset = parsed.get("preset", FIRST[algorithm or Config.algorithm])
+    entry = entry_for(parsed)
+    preset = entry.preset if entry else parsed.get("preset", AUTO)
+    if preset == AUTO:
+        preset = FIRST[algorithm or Config.algorithm]
     if preset not in PRESETS:
         known = ", ".join(PRESETS)
         raise BadInput(f"unknown preset {preset!r} (known: {known}){nearest(preset, PRESETS)}")
@@ -233,7 +242,11 @@ def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
     """Layers defaults < preset < arm < what the user gives and the arm does not fix; unchecked."""
     preset = chosen_preset(parsed)
     free = {name: value for name, value in parsed.items() if name not in fixed_by(arm)}
-    of_env = {"rescale_actions": False} if PUBLISHED.match(parsed.get("env", "")) else {}
+    of_env: dict[str, Any] = (
+        {"rescale_actions": False} if PUBLISHED.match(parsed.get("env", "")) else {}
+    )
+    if entry := entry_for(parsed):
+        of_env["steps"] = entry.steps
     settings = {**of_env, **PRESETS[preset], **arm_settings(arm), **free, "preset": preset}
     return dataclasses.replace(Config(), **settings)
 

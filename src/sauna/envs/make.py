@@ -14,6 +14,7 @@ from sauna.config.plugins import import_module, import_name, is_local
 from sauna.config.settings import NATIVE
 from sauna.envs.host.answers import close
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.envs.host.packages import as_vector, package_of, register
 from sauna.envs.spaces import stretch
 from sauna.system.errors import BadInput, nearest, one_line
 
@@ -48,8 +49,8 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
     import gymnasium
 
     name = _registered(env)
-    return lambda **more: gymnasium.make(
-        name, **{"disable_env_checker": True, **env_kwargs, **more}
+    return lambda **more: as_vector(
+        gymnasium.make(name, **{"disable_env_checker": True, **env_kwargs, **more})
     )
 
 
@@ -123,9 +124,13 @@ def _registered(env: str) -> str:
     if name.startswith("sauna/"):
         tame_mujoco()
         importlib.import_module("sauna.envs.flagrun")
+    package = package_of(name)
+    if package is not None and name not in gymnasium.registry:
+        register(package, name)
     if name not in gymnasium.registry:
         raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
-    if "mujoco" in str(gymnasium.registry[name].entry_point):
+    entry = str(gymnasium.registry[name].entry_point)
+    if "mujoco" in entry or entry.startswith("gymnasium_robotics"):
         tame_mujoco()
     return name
 
@@ -134,6 +139,8 @@ def known_in_this_process_alone(env: str) -> bool:
     """Whether this program registered an id itself: another process would not find it."""
     gymnasium = sys.modules.get("gymnasium")
     if ":" in env or "/" in env or gymnasium is None or env not in gymnasium.registry:
+        return False
+    if package_of(env) is not None:
         return False
     own = Path(gymnasium.envs.__file__).read_text(encoding="utf-8")  # registers them one by one
     return f'"{env}"' not in own

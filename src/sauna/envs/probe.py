@@ -15,10 +15,17 @@ STEPS = 25
 
 
 class Probe(NamedTuple):
-    """`differs` is None where the environment gave the same episode twice."""
+    """What is known of an environment.
+
+    Attributes:
+      spaces: its spaces.
+      differs: None where it gave the same episode twice.
+      time_limit: env steps after which Gymnasium cuts an episode; None if it says no number.
+    """
 
     spaces: Spaces
     differs: str | None
+    time_limit: int | None = None
 
 
 def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
@@ -33,6 +40,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     first, second = make_env(env, env_kwargs), make_env(env, env_kwargs)
     try:
         spaces = describe(first.observation_space, first.action_space)
+        limit = getattr(getattr(first, "spec", None), "max_episode_steps", None)
         _play(first, spaces, seed=1)
         differs = _difference(_play(first, spaces, seed=2), _play(second, spaces, seed=2))
     except BadInput:
@@ -42,7 +50,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     finally:
         close(first)
         close(second)
-    return Probe(spaces, differs)
+    return Probe(spaces, differs, limit if isinstance(limit, int) else None)
 
 
 def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:

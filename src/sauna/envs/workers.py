@@ -19,7 +19,7 @@ from sauna.system.tracebacks import cause_of, describe_failure
 
 STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
 NOTICE = 0.2  # seconds after which the end of a worker is noticed while another one is awaited
-ARRAYS = [name for name in Step._fields if name != "ended"]
+ARRAYS = [name for name in Step._fields if name not in ("ended", "info")]
 
 
 class ProcessEnvs(HostEnvs):
@@ -76,10 +76,15 @@ class ProcessEnvs(HostEnvs):
         for number, part in enumerate(self._parts):
             arrays = {"action": action[part], "active": active[part]}
             self._say(number, {"kind": "step"}, arrays)
-        answers = [self._answer(number).arrays for number in range(len(self._workers))]
-        parts = {name: np.concatenate([a[name] for a in answers]) for name in ARRAYS}
+        answers = [self._answer(number) for number in range(len(self._workers))]
+        parts = {name: np.concatenate([a.arrays[name] for a in answers]) for name in ARRAYS}
         ends = ("terminated", "truncated", "life_lost")
-        return Step(**parts, ended=any(bool(parts[name].any()) for name in ends))
+        info = {
+            int(part[local]): numbers
+            for part, answer in zip(self._parts, answers, strict=True)
+            for local, numbers in answer.header.get("info", ())
+        }
+        return Step(**parts, ended=any(bool(parts[n].any()) for n in ends), info=info)
 
     def snapshot(self, index: int) -> Snapshot:
         number, local = self._find(index)
@@ -141,17 +146,21 @@ class ProcessEnvs(HostEnvs):
         return True
 
 
-def _serve(envs: GymnasiumEnvs, message: Message) -> dict[str, np.ndarray]:
+def _serve(envs: GymnasiumEnvs, message: Message) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """An answer's header and arrays."""
+    header: dict[str, Any] = {"kind": "answer"}
     kind, arrays = message.header["kind"], message.arrays
     if kind == "reset":
-        return {"observation": envs.reset()}
+        return header, {"observation": envs.reset()}
     if kind == "step":
         step = envs.step(arrays["action"], arrays["active"])
-        return {name: getattr(step, name) for name in ARRAYS}
+        if step.info:
+            header["info"] = [*step.info.items()]
+        return header, {name: getattr(step, name) for name in ARRAYS}
     if kind == "snapshot":
-        return envs.snapshot(message.header["index"])
+        return header, envs.snapshot(message.header["index"])
     go_on = envs.restore if kind == "restore" else envs.start_after
-    return {"observation": go_on(message.header["index"], arrays)}
+    return header, {"observation": go_on(message.header["index"], arrays)}
 
 
 def main() -> None:
@@ -164,7 +173,7 @@ def main() -> None:
         envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
         while True:
-            send(outbox, {"kind": "answer"}, _serve(envs, receive(inbox)))
+            send(outbox, *_serve(envs, receive(inbox)))
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:

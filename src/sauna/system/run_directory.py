@@ -4,8 +4,10 @@ config.json     the settings and what each arm differs in, versions, git revisio
 failure.txt     the traceback of what ended it last, if something did
 metrics.jsonl   one row per iteration and member; the same bytes for the same config and seeds
 timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, so apart)
+metrics.csv     both as one table; see metrics_csv.py
 summary.json    how each member ended
 checkpoints/    see checkpoint.py
+init/           a checkpoint of what the run started from, with init_from
 figures/, videos/, tensorboard/
 """
 
@@ -20,6 +22,7 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import time
 from collections.abc import Mapping
@@ -40,7 +43,9 @@ _PARTS: dict[str, type] = {
     "drop_rates": list,
     "code": dict,
     "code_before": list,
+    "extended": list,
 }
+INITIAL = "init"  # the folder of what a run starts from
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -110,6 +115,7 @@ def discard(path: Path, made: bool) -> None:
     with contextlib.suppress(OSError):  # the first error is reported already, and matters more
         (path / "config.json").unlink(missing_ok=True)
         (path / ".lock").unlink(missing_ok=True)
+        shutil.rmtree(path / INITIAL, ignore_errors=True)
         if made:
             path.rmdir()
 
@@ -224,6 +230,13 @@ def is_complete(run: Path) -> bool:
     """Whether the run was trained to its end."""
     path = run / "summary.json"
     return os.path.lexists(path) and bool(_read(path).get("complete"))
+
+
+def reopen_summary(run: Path) -> None:
+    """Notes that a run is not complete any more, as it is to go further."""
+    path = run / "summary.json"
+    if os.path.lexists(path):
+        write_json(path, {**_read(path), "complete": False})
 
 
 def versions() -> dict[str, str]:

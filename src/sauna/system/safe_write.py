@@ -73,26 +73,29 @@ def replacing(path: Path) -> Iterator[Path]:
     """A new empty file beside `path`, of the same suffix, which takes its place at the end.
 
     The place is taken atomically: a reader sees the old file or the new one. Where the body
-    raises, the old file stays and the new one goes.
+    raises, the old file stays.
     """
-    name = f".{path.name}.{secrets.token_hex(8)}.writing{path.suffix}"
-    temporary = path.with_name(name)
-    open_new(temporary).close()
-    try:
+    with _taking_place_of(path, path.suffix) as temporary:
+        open_new(temporary).close()
         yield temporary
         sync_folder(temporary)
-        temporary.replace(path)
-    except Exception:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
 
 
 def replace_file(path: Path, data: bytes) -> None:
     """Writes `data` in the place of a file, atomically and durably."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.writing")
-    try:
+    with _taking_place_of(path) as temporary:
         write_durably(temporary, data)
+
+
+@contextmanager
+def _taking_place_of(path: Path, suffix: str = "") -> Iterator[Path]:
+    """A name beside `path` for a file that the body writes, and that then takes its place.
+
+    Where the body raises, the old file stays and the new one goes.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.writing{suffix}")
+    try:
+        yield temporary
         temporary.replace(path)
     except Exception:
         temporary.unlink(missing_ok=True)

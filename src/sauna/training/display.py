@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.training.summary import with_evaluation
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
+NAMED = 6  # members that a progress line names; of more it gives the mean of each arm
 
 
 class Display(Protocol):
@@ -54,13 +57,17 @@ class _Progress:
         self.phases: dict[int, str] = {}
         self.seconds_left: float | None = None
         self.rate: float | None = None
+        self.succeeds = False  # whether environments say if an episode was a success
         self._first: tuple[float, int] | None = None
+        self._take(rows)
+
+    def _take(self, rows: list[dict[str, Any]]) -> None:
         for row in rows:
-            self.latest[row["member"]] = row
+            self.latest[row["member"]] = with_evaluation(row, self.latest[row["member"]])
+            self.succeeds |= "success_rate" in row
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
-        for row in rows:
-            self.latest[row["member"]] = row
+        self._take(rows)
         done, now = sum(map(self.budget_used, self.latest)), time.monotonic()
         if self._first is None:
             if all(self.latest.values()):
@@ -81,8 +88,10 @@ class _Progress:
             self.config.steps * len(self.latest)
         )
         if self.rate is None:
-            waiting = sorted(set(self.phases.values())) or ["starting"]
-            return ", ".join(waiting) + ("" if share == 0 else f", {share:.0%}")
+            waiting = sorted(set(self.phases.values()))
+            if share > 0:
+                waiting.append(f"{share:.0%}")
+            return ", ".join(waiting) or "starting"
         left = "" if self.seconds_left is None else f", {duration(self.seconds_left)} left"
         return f"{share:.0%}, {self.rate:,.0f} {self.config.budget} steps/s{left}"
 
@@ -94,17 +103,26 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Writes `1 task` or `2 tasks`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def number(row: dict[str, Any] | None, key: str, form: str) -> str:
     """Formats a number of a row; `-` if it is not there."""
     return format(row[key], form) if row and key in row else "-"
 
 
 class PlainDisplay:
-    """Lines of text, one every few seconds."""
+    """Lines of text: one for each phase, then one every few seconds.
+
+    The gap between two lines doubles until there are new rows.
+    """
 
     def __init__(self) -> None:
         self._progress: _Progress | None = None
-        self._shown = time.monotonic()
+        self._start = self._shown = time.monotonic()
+        self._gap = PLAIN_SECONDS
         self._phases: set[str] = set()
 
     def say(self, text: str) -> None:
@@ -119,32 +137,54 @@ class PlainDisplay:
     def phase(self, process: int, text: str) -> None:
         if text not in self._phases:
             self._phases.add(text)
-            self.say(text)
+            self.say(f"{self._elapsed()} {text}")
+
+    def _elapsed(self) -> str:
+        return duration(time.monotonic() - self._start)
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
         assert self._progress is not None
         self._progress.rows(rows)
+        self._gap = PLAIN_SECONDS
 
     def refresh(self) -> None:
         progress = self._progress
-        if progress is None or time.monotonic() - self._shown < PLAIN_SECONDS:
+        if progress is None or time.monotonic() - self._shown < self._gap:
             return
         self._shown = time.monotonic()
-        returns = ", ".join(
-            f"{name} {number(row, 'return_mean', '.1f')}" for name, row in progress.latest.items()
-        )
-        self.say(f"{progress.status()}; return: {returns}")
+        self._gap *= 2
+        if any(progress.latest.values()):
+            self.say(f"{self._elapsed()} {progress.status()}; {returns(progress.latest)}")
+        else:
+            self.say(f"{self._elapsed()} the first iteration is not done yet")
 
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
         for name, row in members.items():
             self.say(
                 f"{name}: return {number(row, 'return_mean', '.2f')} "
                 f"(training, last 100 episodes), {row['env_steps']:,} env steps, "
-                f"{row['kept_steps']:,} kept"
+                f"{row['kept_steps']:,} kept{evaluated(row)}"
             )
 
     def close(self) -> None:
         pass
+
+
+def returns(latest: Mapping[str, dict[str, Any] | None]) -> str:
+    """Writes the returns of the members, or of more than `NAMED` the mean of each arm.
+
+    Args:
+      latest: the newest row of each member, `arm/seed`; None before the first.
+    """
+    if len(latest) <= NAMED:
+        shown = (f"{name} {number(row, 'return_mean', '.1f')}" for name, row in latest.items())
+        return f"return: {', '.join(shown)}"
+    of_arm: dict[str, list[float]] = {}
+    for name, row in latest.items():
+        own = of_arm.setdefault(name.rpartition("/")[0], [])
+        own += [row["return_mean"]] if row and "return_mean" in row else []
+    means = (f"{arm} {sum(v) / len(v):.1f}" if v else f"{arm} -" for arm, v in of_arm.items())
+    return f"mean return: {', '.join(means)}"
 
 
 class LiveDisplay:
@@ -189,7 +229,7 @@ class LiveDisplay:
         assert self._progress is not None
         table = Table(title=self._progress.status(), title_justify="left", box=None)
         table.add_column("member")
-        columns = columns_of(self._progress.members)
+        columns = columns_of(self._progress.members, self._progress.succeeds)
         for title, _, _ in columns:
             table.add_column(title, justify="right")
         for name, row in self._progress.latest.items():
@@ -200,6 +240,9 @@ class LiveDisplay:
         self.refresh()
         self.close()
         self.say("return: mean training return of the last 100 episodes")
+        for name, row in members.items():
+            if text := evaluated(row):
+                self.say(f"{name}{text}")
 
     def close(self) -> None:
         if self._live is not None:
@@ -207,10 +250,24 @@ class LiveDisplay:
             self._live = None
 
 
-def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
+def evaluated(row: dict[str, Any]) -> str:
+    """Says what a member's evaluations came to, and whether it was stopped early."""
+    text = ""
+    if "eval_return_mean" in row:
+        text = (
+            f"; evaluation: return {row['eval_return_mean']:.2f}, best "
+            f"{row['eval_return_best']:.2f}, {row['eval_env_steps']:,} env steps of its own"
+        )
+    if "stopped_early" in row:
+        text += f"; stopped early ({row['stopped_early']})"
+    return text
+
+
+def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str, str, str]]:
     """The live table's columns: title, key in a row, format.
 
-    What only a rule or a Vex head has is shown if a member has one.
+    What only a rule or a Vex head has is shown if a member has one; the rate of successes where
+    environments say so (`succeeds`).
     """
     columns = [
         ("env steps", "env_steps", ",d"),
@@ -221,11 +278,15 @@ def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
         ("KL", "kl", ".4f"),
         ("expl. var.", "explained_variance", ".2f"),
     ]
+    if succeeds:
+        columns.insert(3, ("success", "success_rate", ".0%"))
     configs = [member.config for member in members]
+    if any(config.eval_every for config in configs):
+        columns.insert(3, ("evaluation", "eval_return_mean", ".1f"))
     if any(config.filter != "none" for config in configs):
         columns.append(("keep rate", "keep_rate", ".3f"))
     if any(config.sampler != "none" for config in configs):
-        columns.append(("sample rate", "sample_rate", ".3f"))
+        columns.append(("samples used", "sample_rate", ".3f"))
     if any(config.vex_coef > 0 for config in configs):
         columns += [("Vex mean", "vex_mean", ".3f"), ("Vex spread", "vex_spread", ".3f")]
     return columns
@@ -234,8 +295,8 @@ def columns_of(members: list[Member]) -> list[tuple[str, str, str]]:
 def headline(config: Config, members: list[Member], path: Path) -> str:
     """Says in one line what is trained, and where it is written."""
     return (
-        f"{config.env}: {len(members)} member{'s' if len(members) > 1 else ''} "
-        f"({', '.join(config.arm)} x {len(config.seeds)} seeds), {config.steps:,} "
+        f"{config.env}: {counted(len(members), 'member')} "
+        f"({', '.join(config.arm)} x {counted(len(config.seeds), 'seed')}), {config.steps:,} "
         f"{'env' if config.budget == 'env' else 'kept'} steps each, preset {config.preset}, "
         f"{config.processes} process{'es' if config.processes > 1 else ''}; writing to {path}"
     )

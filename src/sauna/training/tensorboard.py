@@ -37,7 +37,8 @@ class TensorBoard:
             if row["episode_returns"]:
                 mean = sum(row["episode_returns"]) / len(row["episode_returns"])
                 writer.add_scalar("episode_return", mean, step)
-            writer.add_scalar("steps_per_second", timing["steps_per_second"], step)
+            for name in ("steps_per_second", "wall_seconds"):
+                writer.add_scalar(name, timing[name], step)
 
     def _writer(self, row: dict[str, Any]) -> Any:
         from tensorboardX import SummaryWriter

@@ -23,12 +23,12 @@ from sauna.algorithm.learner.update import Parts
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState
 from sauna.envs.spaces import Spaces
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import Span, decide
 from sauna.experiments.inspect.inspection import Inspection, examine
 from sauna.experiments.inspect.learned import Learned, draws_of, learned, reads_rollouts
 from sauna.experiments.inspect.page import notes, page_data
+from sauna.training.artifact import load_artifact
 
 STEPS, ENVS, ROLLOUTS, SEED, ITERATION = 12, 2, 2, 5, 3
 ROWS = STEPS * ENVS

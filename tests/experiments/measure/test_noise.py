@@ -368,7 +368,7 @@ def test_an_alignment_says_how_many_checkpoints_it_is_known_at() -> None:
     unknown = point(1.0, 0.01)
     unknown["rules"]["standardized"]["groups"]["kept"]["alignment"] = [None, None, None]
     head, row = text_table(measured([point(0.5, 0.01), unknown], [point(0.5, 0.01)]))
-    assert row[head.index("Alignment of kept")] == "1.0 [1.0, 1.0], 2 of 3"
+    assert row[head.index("Alignment of kept, checkpoints")] == "1.0 [1.0, 1.0], 2 of 3"
 
 
 def test_what_is_not_measured_yet_is_told() -> None:

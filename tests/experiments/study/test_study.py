@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from command_line import sauna, small_flags
+from command_line import sauna, sauna_here, small_flags
 from helpers import SMALL, environment
 from sauna.api import compare
 from sauna.config.presets import ARMS, COMPARED
@@ -122,6 +122,17 @@ def test_the_auc_is_that_of_the_budget() -> None:
     assert _ended(rows, 300)["auc"] == 200.0
     assert _ended(rows, 400)["auc"] == 250.0
     assert _ended([], 400)["auc"] is None
+
+
+def test_a_member_that_stopped_early_keeps_its_last_return() -> None:
+    rows = [{"env_steps": n, "return_mean": n / 100, "samples_backward": 5.0} for n in (100, 200)]
+    ended = _ended(rows, 400, stopped_early=True)
+    assert ended["auc"] == (1.5 * 100 + 2.0 * 200) / 300
+    assert (ended["env_steps"], ended["final_return"], ended["samples_backward"]) == (200, 2.0, 10)
+    assert ended["curve"]["env_steps"] == [100, 200, 400]
+    assert ended["curve"]["return_mean"] == [1.0, 2.0, 2.0]
+    assert ended["curve"]["samples_backward"] == [5.0, 10.0, 10.0]
+    assert _ended(rows, 400)["auc"] == 1.5
 
 
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
@@ -239,7 +250,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-FLAGS = [*small_flags(seeds=4), "--processes=2"]
+FLAGS = [*small_flags(seeds=2), "--processes=2"]
 
 
 def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) -> None:
@@ -251,7 +262,7 @@ def test_a_comparison_trains_every_arm_and_says_what_it_found(compared: Path) ->
     assert [c["label"] for c in results["cells"]] == ["ppo", "vex-head", "sauna+random", "sauna"]
     for cell in results["cells"]:
         assert [(m["seed"], m["status"]) for m in cell["members"]] == [
-            (seed, "complete") for seed in range(4)
+            (seed, "complete") for seed in range(2)
         ]
         for member in cell["members"]:
             assert 128 - 32 < member["env_steps"] <= 128
@@ -267,7 +278,7 @@ def test_the_control_begins_as_its_arm_does_and_learns_otherwise(compared: Path)
     for path in (compared / "units").rglob("metrics.jsonl"):
         for row in run_directory.rows(path.parent):
             rows.setdefault((row["arm"], row["seed"]), []).append(row)
-    for seed in range(4):
+    for seed in range(2):
         arm, control = rows["sauna", seed], rows["sauna+random", seed]
         assert arm[0]["keep_rate"] == control[0]["keep_rate"]
         assert arm[-1]["policy_loss"] != control[-1]["policy_loss"]
@@ -280,14 +291,14 @@ def stamps(out: Path) -> dict[Path, int]:
 
 def test_running_again_repeats_nothing(compared: Path) -> None:
     before = stamps(compared)
-    done = sauna("compare", "worlds:Scripted", "--out", str(compared), *FLAGS)
+    done = sauna_here("compare", "worlds:Scripted", "--out", str(compared), *FLAGS)
     assert done.returncode == 0
     assert stamps(compared) == before
 
 
 def test_python_finds_what_the_command_made(compared: Path) -> None:
     before = stamps(compared)
-    summary = compare("worlds:Scripted", seeds=4, out=compared, processes=2, quiet=True, **QUICK)
+    summary = compare("worlds:Scripted", seeds=2, out=compared, processes=2, quiet=True, **QUICK)
     assert stamps(compared) == before
     place = next(p for p in compared.iterdir() if p.name.startswith("compare_"))
     assert json.loads((place / "summary.json").read_text()) == summary
@@ -297,7 +308,7 @@ def test_python_finds_what_the_command_made(compared: Path) -> None:
 
 def test_in_python_quiet_is_quiet_also_from_a_thread(compared: Path, capfd) -> None:
     found: list[Any] = []
-    settings = {"seeds": 4, "out": compared, "processes": 2, "quiet": True, **QUICK}
+    settings = {"seeds": 2, "out": compared, "processes": 2, "quiet": True, **QUICK}
     thread = threading.Thread(target=lambda: found.append(compare("worlds:Scripted", **settings)))
     thread.start()
     thread.join()
@@ -396,7 +407,7 @@ def test_a_complete_run_counts_even_if_the_unit_was_split(tmp_path: Path) -> Non
 def test_a_second_study_in_the_same_place_is_refused(tmp_path: Path) -> None:
     (tmp_path / "units").mkdir()
     with run_directory.lock(tmp_path / "units"):
-        done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
+        done = sauna_here("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
     assert done.returncode == 2 and "is in use by process" in done.stderr
     assert {path.name for path in tmp_path.rglob("*")} == {"units", ".lock"}
 
@@ -430,7 +441,7 @@ def test_lines_that_are_no_messages_are_passed_over(tmp_path: Path, monkeypatch)
 
 
 def test_what_a_run_would_refuse_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    done = sauna("compare", "CartPole-v1", "--log-std-init", "0.5", cwd=tmp_path)
+    done = sauna_here("compare", "CartPole-v1", "--log-std-init", "0.5", cwd=tmp_path)
     assert done.returncode == 2 and "it needs continuous actions" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
@@ -448,5 +459,5 @@ def test_another_study_of_the_same_name_is_refused(tmp_path: Path) -> None:
         tmp_path / "one" / "study.json", {"study": {"x": 1}, "seeds_per_unit": 3}
     )
     (tmp_path / "one.toml").write_text('tasks = ["CartPole-v1"]\n[[arms]]\nlabel = "ppo"\n')
-    done = sauna("study", "one.toml", "--out", ".", cwd=tmp_path)
+    done = sauna_here("study", "one.toml", "--out", ".", cwd=tmp_path)
     assert done.returncode == 2 and "another study of this name" in done.stderr

@@ -7,15 +7,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from sauna.algorithm.learner.losses import weighted_mean
-from sauna.algorithm.types import Array
+from sauna.algorithm.types import Array, Params
 
 
 class Work(NamedTuple):
     """What one iteration's update took; `[]` each."""
 
     gradient_steps: Array
-    sample_rate: Array  # rows that the policy loss draws per epoch, of those that are there
-    samples_forward: Array  # rows through the network, with those that a rule only looks at
+    sample_rate: Array  # rows that the policy loss draws per epoch, of the rollout's
+    samples_forward: Array  # rows through the network, with those that only a rule needs
     samples_backward: Array  # rows through its gradient, also of a step that a stop rule forbids
     effective_sample_size: Array  # (sum w)^2 / sum w^2 of a minibatch's policy weights, the mean
 
@@ -39,6 +39,7 @@ class UpdateMetrics(NamedTuple):
     vex_spread: Array  # their standard deviation
     vex_median: Array
     threshold: Array  # where it moves: that of this iteration; else NaN
+    policy_std: Array  # mean over the action's components, after the update; NaN if discrete
     finite: Array  # bool: parameters and losses are finite
     work: Work
 
@@ -50,6 +51,12 @@ def variance_explained(return_: Array, value: Array, weight: Array) -> Array:
         return weighted_mean((x - weighted_mean(x, weight)) ** 2, weight)
 
     return 1.0 - variance(return_ - value) / variance(return_)
+
+
+def policy_std(params: Params) -> Array:
+    """The mean of the policy's standard deviations, which depend on no state; NaN without any."""
+    log_std = params["params"].get("log_std")
+    return jnp.float32(jnp.nan) if log_std is None else jnp.mean(jnp.exp(log_std))
 
 
 def head_statistics(vex: Array, valid: Array) -> tuple[Array, Array, Array]:

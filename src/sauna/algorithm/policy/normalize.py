@@ -39,18 +39,23 @@ def update_moments(moments: Moments, batch: Any, active: Any) -> Moments:
       batch: `[..., N, D]`.
       active: `[..., N]` bool; other rows count for nothing. Where none is, nothing changes.
     """
-    weight = active[..., None]
-    number = weight.sum(-2)
-    divisor = number + (number == 0)
-    batch_mean = (batch * weight).sum(-2) / divisor
-    deviation = (batch - batch_mean[..., None, :]) * weight
-    batch_variance = (deviation**2).sum(-2) / divisor
+    batch_mean, batch_variance, number = _moments_of(batch, active)
     total = moments.count + number
     fraction = number / total
     delta = batch_mean - moments.mean
     move = delta * fraction
     variance = (moments.variance + delta * move) * (moments.count / total)
     return Moments(moments.mean + move, variance + batch_variance * fraction, total)
+
+
+def _moments_of(batch: Any, active: Any) -> Moments:
+    """Mean, variance and number of the active rows of a batch; see `update_moments`."""
+    weight = active[..., None]
+    number = weight.sum(-2)
+    divisor = number + (number == 0)
+    mean = (batch * weight).sum(-2) / divisor
+    deviation = (batch - mean[..., None, :]) * weight
+    return Moments(mean, (deviation**2).sum(-2) / divisor, number)
 
 
 class LongMoments(NamedTuple):
@@ -97,12 +102,7 @@ def update_long_moments(moments: LongMoments, batch: Any, active: Any) -> LongMo
 
     `mean += f d` and `var += f (var_b - var_a + (1 - f) d^2)`.
     """
-    weight = active[..., None]
-    number = weight.sum(-2)
-    divisor = number + (number == 0)
-    batch_mean = (batch * weight).sum(-2) / divisor
-    deviation = (batch - batch_mean[..., None, :]) * weight
-    batch_variance = (deviation**2).sum(-2) / divisor
+    batch_mean, batch_variance, number = _moments_of(batch, active)
     fraction = number / (moments.count + number)
     delta = batch_mean - moments.mean
     spread = batch_variance - moments.variance + (1.0 - fraction) * delta**2
@@ -123,11 +123,20 @@ def moments_after_each(moments: Moments, values: Any, valid: Any) -> Moments:
     Args:
       moments: scalars.
     """
-    deviation = (values - moments.mean) * valid
-    count = moments.count + valid.sum(1).cumsum()
-    shift = deviation.sum(1).cumsum() / count
-    square = moments.count * moments.variance + (deviation**2).sum(1).cumsum()
+    _, count, shift, squares = _sums_about_mean(moments, values, valid)
+    square = moments.count * moments.variance + squares
     return Moments(moments.mean + shift, (square / count - shift**2).clip(0.0), count)
+
+
+def _sums_about_mean(
+    moments: Moments | LongMoments, values: Any, valid: Any
+) -> tuple[Any, Any, Any, Any]:
+    """After each row of `values` `[S, N]`, `[S]` each: samples seen in the rows and in all, how far
+    the mean has moved, and the sum of squares about the mean before."""
+    deviation = (values - moments.mean) * valid
+    number = valid.sum(1).cumsum()
+    count = moments.count + number
+    return number, count, deviation.sum(1).cumsum() / count, (deviation**2).sum(1).cumsum()
 
 
 def long_moments_after_all(
@@ -140,11 +149,8 @@ def long_moments_after_all(
     Args:
       moments: scalars.
     """
-    deviation = (values - moments.mean) * valid
-    number = valid.sum(1).cumsum()
-    count = moments.count + number
-    shift = deviation.sum(1).cumsum() / count
-    spread = ((deviation**2).sum(1).cumsum() - number * moments.variance) / count - shift**2
+    number, count, shift, squares = _sums_about_mean(moments, values, valid)
+    spread = (squares - number * moments.variance) / count - shift**2
     each = Moments(moments.mean + shift, (moments.variance + spread).clip(0.0), count)
     return each, _add(moments, shift[-1], spread[-1], 1.0 * number[-1])
 

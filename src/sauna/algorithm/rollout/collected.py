@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from sauna.algorithm.types import Rollout
@@ -28,6 +29,7 @@ class Collected(NamedTuple):
     return_mean: float  # over all of them; NaN if there are none
     length_mean: float
     episodes: list[Episode]  # the latest of them; on the host all
+    info: Mapping[str, float]  # means over all that gave the number in their last `info`
 
 
 def capacity(config: Config) -> int:

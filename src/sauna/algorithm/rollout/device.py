@@ -59,6 +59,7 @@ class Ends(NamedTuple):
     kept: Array  # [WINDOW] bool, whether the last step was kept
     env: Array  # [WINDOW] int32
     there: Array  # [WINDOW] bool; False: the slot is empty
+    info: dict[str, Array]  # [] float32, means over all that gave the number; NaN if none did
 
 
 class Faults(NamedTuple):
@@ -97,6 +98,7 @@ class _Row(NamedTuple):
     episode_return: Array  # with this step
     episode_length: Array
     finite: Array
+    info: dict[str, Array]  # what an episode's last step says of it
 
 
 class _Carry(NamedTuple):
@@ -250,6 +252,7 @@ def _step(
         episode_return,
         episode_length,
         ~acting | _finite_rows(transition.observation, envs.observation, reward),
+        transition.info,
     )
     return _Carry(carry.t + 1, after, filter_state, carry.kept + keep), row
 
@@ -348,6 +351,10 @@ def _ends(rows: _Row) -> Ends:
     def mean(x: Array) -> Array:
         return jnp.sum(jnp.where(ended, x.ravel(), 0.0)) / number
 
+    def mean_of_given(x: Array) -> Array:
+        given = ended & jnp.isfinite(x.ravel())
+        return jnp.sum(jnp.where(given, x.ravel(), 0.0)) / jnp.sum(given)
+
     return Ends(
         number,
         mean(rows.episode_return),
@@ -358,6 +365,7 @@ def _ends(rows: _Row) -> Ends:
         pick(rows.keep),
         pick(env),
         latest >= 0,
+        {name: mean_of_given(x) for name, x in dict(rows.info).items()},
     )
 
 

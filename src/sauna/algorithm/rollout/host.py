@@ -28,6 +28,7 @@ from sauna.algorithm.rollout.moments import ObservationMoments, discounted_retur
 from sauna.algorithm.rollout.program import Program
 from sauna.algorithm.types import Hypers, Keys, Rollout, ScoredStep
 from sauna.envs.host.contract import HostEnvs, Step
+from sauna.envs.info import info_means
 from sauna.envs.spaces import Spaces
 
 _fold_in = jax.jit(jax.random.fold_in)  # compiled: rollouts of few steps draw a key often
@@ -73,6 +74,7 @@ class HostCollector:
         self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
         self._over = np.zeros(self._rewards.shape, bool)  # episodes; a lost life is not one's end
+        self._infos: list[list[Any]] = [[] for _ in keys]  # of each member's ended episodes
         self._chunks = chunk_sizes(self._config.rollout_steps)
         self._uncompiled = program.filter is not None  # without one, every segment is a rollout
         if program.filter is not None:
@@ -133,6 +135,7 @@ class HostCollector:
         for name in ("valid", "keep", "terminated", "truncated"):
             getattr(buffers, name)[:] = False
         self._over[:] = False
+        self._infos = [[] for _ in members]
         if self._uncompiled:
             self._compile_segments(params[0], hypers[0])
         self._actor.load(params)
@@ -238,6 +241,10 @@ class HostCollector:
         terminated = step.terminated.reshape(self._shape) & acting
         truncated = step.truncated.reshape(self._shape) & acting
         self._over[:, row] = terminated | truncated
+        for index in sorted(step.info):
+            member, env = divmod(index, self._shape[1])
+            if self._over[member, row, env]:
+                self._infos[member].append(step.info[index])
         terminated |= step.life_lost.reshape(self._shape) & acting
         self._buffers.terminated[:, row] = terminated
         self._buffers.truncated[:, row] = truncated
@@ -338,6 +345,7 @@ class HostCollector:
             sum(returns) / len(returns) if returns else math.nan,
             sum(lengths) / len(lengths) if lengths else math.nan,
             episodes,
+            info_means(self._infos[member]),
         )
 
     def _finish(self, member: int) -> list[Episode]:

@@ -11,7 +11,7 @@ import gymnasium
 import jax
 import numpy as np
 
-from sauna.envs.device.contract import JaxEnv
+from sauna.envs.device.contract import JaxEnv, Transition, numbers_in
 
 # `split(key)[i]` is `fold_in(key, i)`: whoever plays an episode folds its env steps into the same
 # seed's key for the actions, and those must not be what the reset draws from.
@@ -27,7 +27,7 @@ class HostFace(gymnasium.Env):
         self.observation_space, self.action_space = env.observation_space, env.action_space
         self.render_mode, self._env = render_mode, env
         self.metadata = {**HostFace.metadata, "render_fps": env.frames_per_second}
-        self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
+        self._reset, self._step = jax.jit(env.reset), jax.jit(self._compiled_step)
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
@@ -43,7 +43,12 @@ class HostFace(gymnasium.Env):
         self._state = transition.state
         truncated = bool(transition.truncated) and not bool(transition.terminated)
         seen = self._read(transition.observation)
-        return seen, float(transition.reward), bool(transition.terminated), truncated, {}
+        info = {name: float(number) for name, number in transition.info.items()}
+        return seen, float(transition.reward), bool(transition.terminated), truncated, info
+
+    def _compiled_step(self, state: Any, action: Any) -> Transition:
+        transition = self._env.step(state, action)
+        return transition._replace(info=numbers_in(transition.info))
 
     def _read(self, observation: Any) -> Any:
         return jax.tree.map(np.asarray, observation)

@@ -62,7 +62,12 @@ def from_brax(
                 reward += inner.reward
         steps = state.steps + 1
         transition = Transition(
-            State(inner, steps), seen(inner), reward, inner.done > 0, jnp.asarray(steps >= limit)
+            State(inner, steps),
+            seen(inner),
+            reward,
+            inner.done > 0,
+            jnp.asarray(steps >= limit),
+            inner.metrics,
         )
         return ended_where_broken(transition)
 

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from sauna.envs.info import is_metric_name, is_one_number, numbers_of
+
 State = Any  # a pytree of arrays; whatever is random in an environment keeps its key in there
 
 
@@ -26,6 +28,22 @@ class Transition(NamedTuple):
     reward: Array  # [] float32
     terminated: Array  # [] bool
     truncated: Array  # [] bool: a time limit, and not terminated
+    # Numbers [] by name, the same names always: where an episode ends they become metrics.
+    info: Any = ()
+
+
+def numbers_in(info: Any) -> dict[str, Array]:
+    """The single numbers `[]` of a `Transition.info`, as float32; what else it holds is left out.
+
+    What is no number would not pass through a compiled function.
+    """
+    found: dict[str, Array] = {}
+    for name, value in dict(info).items():
+        if not isinstance(value, Array):  # known when compiled
+            found |= {n: jnp.float32(number) for n, number in numbers_of({name: value}).items()}
+        elif is_metric_name(name) and is_one_number(value):
+            found[name] = value.astype(jnp.float32).reshape(())
+    return found
 
 
 class JaxEnv(NamedTuple):
@@ -56,11 +74,11 @@ def ended_where_broken(transition: Transition) -> Transition:
 
     For physics alone, where that is a known end; other environments are reported as faulty.
     """
-    sound = jnp.all(jnp.isfinite(transition.observation)) & jnp.isfinite(transition.reward)
-    terminated = transition.terminated | ~sound
+    is_finite = jnp.all(jnp.isfinite(transition.observation)) & jnp.isfinite(transition.reward)
+    terminated = transition.terminated | ~is_finite
     return transition._replace(
-        observation=jnp.where(sound, transition.observation, 0.0),
-        reward=jnp.where(sound, transition.reward, 0.0),
+        observation=jnp.where(is_finite, transition.observation, 0.0),
+        reward=jnp.where(is_finite, transition.reward, 0.0),
         terminated=terminated,
         truncated=transition.truncated & ~terminated,
     )
@@ -90,6 +108,7 @@ def flat(env: JaxEnv, rescale: bool = False) -> JaxEnv:
             observation=read(transition.observation),
             reward=jnp.asarray(transition.reward, jnp.float32),
             truncated=transition.truncated & ~transition.terminated,
+            info=numbers_in(transition.info),
         )
 
     return env._replace(reset=reset, step=step)

@@ -40,12 +40,13 @@ def make(name: str, **params: Any) -> JaxEnv:
 
     def step(state: State, action: jax.Array) -> Transition:
         key, step_key = jax.random.split(state.key)
-        observation, inner, reward, terminated, _ = env.step_env(
+        observation, inner, reward, terminated, info = env.step_env(
             step_key, state.inner, action, fixed
         )
         terminated = jax.numpy.asarray(terminated, bool)
         truncated = jax.numpy.asarray(env.is_truncated(inner, fixed), bool) & ~terminated
-        return Transition(State(inner, key), observation, reward, terminated, truncated)
+        info = {name: number for name, number in info.items() if name != "discount"}  # 0 at an end
+        return Transition(State(inner, key), observation, reward, terminated, truncated, info)
 
     return JaxEnv(
         reset, step, _space(env.observation_space(fixed)), _space(env.action_space(fixed))

@@ -70,7 +70,12 @@ def flagrun_mjx() -> JaxEnv:
         next_state = FlagrunState(qpos, qvel, data.qacc_warmstart, outcome.task, key)
         reward = sum(outcome.reward, start=jnp.zeros(()))
         return Transition(
-            next_state, outcome.observation, reward, outcome.terminated, outcome.truncated
+            next_state,
+            outcome.observation,
+            reward,
+            outcome.terminated,
+            outcome.truncated,
+            outcome.reward._asdict(),
         )
 
     painters: list[Painter] = []  # made when first used

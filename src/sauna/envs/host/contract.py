@@ -6,11 +6,14 @@ next episode and `final_observation` holds the one that the ended episode really
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 Snapshot = dict[str, np.ndarray]
+NO_INFO: Mapping[int, Mapping[str, float]] = MappingProxyType({})
 
 
 class Step(NamedTuple):
@@ -26,6 +29,8 @@ class Step(NamedTuple):
     life_lost: np.ndarray  # [M] bool, an end for learning alone: the episode goes on
     final_observation: np.ndarray  # [M, *obs], meaningful where an episode ended
     ended: bool  # whether any episode ended or life was lost: what most steps have to look at
+    # The numbers of `info` where an episode ended, by the environment's row and their name.
+    info: Mapping[int, Mapping[str, float]] = NO_INFO
 
 
 class HostEnvs(Protocol):

@@ -14,6 +14,7 @@ import numpy as np
 
 from sauna.envs.host.answers import close, life_lost, one_number, reset_with
 from sauna.envs.host.contract import HostEnvs, Snapshot, Step, episode_seed
+from sauna.envs.info import numbers_of
 from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.system.errors import SaunaError, one_line
 
@@ -66,6 +67,7 @@ class GymnasiumEnvs(HostEnvs):
         self._terminated = np.zeros(number, bool)
         self._truncated = np.zeros(number, bool)
         self._life_lost = np.zeros(number, bool)
+        self._info: dict[int, dict[str, float]] = {}  # of this step
 
     def reset(self) -> np.ndarray:
         for index, slot in enumerate(self._slots):
@@ -102,6 +104,7 @@ class GymnasiumEnvs(HostEnvs):
         self._terminated[:] = False
         self._truncated[:] = False
         self._life_lost[:] = False
+        self._info = {}
         ended = False
         for index in np.flatnonzero(active):
             ended |= self._step_one(int(index), self._slots[index], action[index])
@@ -117,6 +120,7 @@ class GymnasiumEnvs(HostEnvs):
             self._life_lost,
             self._final,
             ended,
+            self._info,
         )
 
     def _take(self, slot: Slot, action: np.ndarray) -> Any:
@@ -135,6 +139,8 @@ class GymnasiumEnvs(HostEnvs):
         if terminated or truncated:
             self._terminated[index] = terminated
             self._truncated[index] = truncated and not terminated
+            if numbers := numbers_of(info):
+                self._info[index] = numbers
             self._put(self._final, index, observation)
             self._final_sum = _square(self._final)
             self._check_finite(np.arange(len(self._slots)) == index)

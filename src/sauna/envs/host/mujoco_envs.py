@@ -16,6 +16,7 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 from sauna.envs.host.contract import Snapshot, Step
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs, Slot
 from sauna.envs.host.mujoco_tasks import TASKS, Outcome, make_task
+from sauna.envs.info import numbers_of
 from sauna.system.compiled import compiled
 from sauna.system.errors import one_line
 
@@ -86,6 +87,7 @@ class MujocoEnvs(GymnasiumEnvs):
         if self._over:
             self._terminated[:] = False
             self._truncated[:] = False
+            self._info = {}
         _clip(action, self._low, self._high, self._clipped)
         try:
             self._task.step(active, self._clipped, self._outcome)
@@ -106,13 +108,14 @@ class MujocoEnvs(GymnasiumEnvs):
         return _all_finite(self._observation, self._reward)
 
     def _end(self, active: np.ndarray) -> None:
-        """Keeps the final observation of every ended episode and starts the next one."""
+        """Keeps what every ended episode ended with, and starts the next one."""
         self._terminated &= active
-        for index in np.flatnonzero(active):
+        for index in np.flatnonzero(active).tolist():
             if self._terminated[index] or self._steps[index] >= self._limit:
                 self._truncated[index] = not self._terminated[index]
                 self._final[index] = self._observation[index]
-                self._start_episode(int(index), self._slots[index])
+                self._info[index] = numbers_of(self._task.info(index, self._clipped[index]))
+                self._start_episode(index, self._slots[index])
 
 
 @compiled

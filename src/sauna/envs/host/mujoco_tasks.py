@@ -53,6 +53,7 @@ class Task:
 
     def __init__(self, envs: list[Any]) -> None:
         self.envs = envs
+        self._infos: list[dict[str, Any]] = [{} for _ in envs]  # of each one's last step
 
     def gather(self, index: int) -> None:
         """Reads the state of environment `index`, which was reset or replayed."""
@@ -62,7 +63,12 @@ class Task:
         observation, reward, terminated = out
         for i, on in enumerate(active.tolist()):
             if on:
-                observation[i], reward[i], terminated[i], _, _ = self.envs[i].step(action[i])
+                observation[i], reward[i], terminated[i], _, info = self.envs[i].step(action[i])
+                self._infos[i] = info
+
+    def info(self, index: int, action: np.ndarray) -> dict[str, Any]:
+        """Gymnasium's `info` of the step that environment `index` has just taken."""
+        return self._infos[index]
 
 
 class BatchTask(Task):
@@ -77,6 +83,7 @@ class BatchTask(Task):
         model = envs[0].model
         self.state = np.zeros((len(envs), model.nq + model.nv))
         self.qpos, self.qvel = self.state[:, : model.nq], self.state[:, model.nq :]
+        self._begun = np.zeros((len(envs), 2))  # first two positions before the last step
         self._control = np.zeros(model.nu)
         self._frame_skip = envs[0].frame_skip
         # Made alike, the environments have equal models: one is stepped, half a megabyte each saved
@@ -88,6 +95,7 @@ class BatchTask(Task):
         self.qpos[index], self.qvel[index] = data.qpos, data.qvel
 
     def step(self, active: np.ndarray, action: np.ndarray, out: Outcome) -> None:
+        self._begun[:] = self.state[:, :2]
         _advance(
             self._addresses,
             self._frame_skip,
@@ -98,6 +106,26 @@ class BatchTask(Task):
             self.state,
         )
         self.evaluate(action, out)
+
+    def info(self, index: int, action: np.ndarray) -> dict[str, Any]:
+        """Lets the environment itself take its last step again, without the physics of it.
+
+        Of where a step began, Gymnasium's tasks read the first two positions alone.
+        """
+        env, begun = self.envs[index], self._begun[index]
+        positions = env.data.qpos
+        reached = positions[: len(begun)].copy()
+
+        def simulate(*_: Any) -> None:
+            positions[: len(begun)] = reached
+
+        positions[: len(begun)] = begun
+        env.do_simulation = simulate
+        try:
+            return env.step(action)[4]
+        finally:
+            del env.do_simulation
+            simulate()
 
     def evaluate(self, action: np.ndarray, out: Outcome) -> None:
         """Writes what the new states come to."""

@@ -16,7 +16,6 @@ from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState, membe
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frames_per_second
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, until
@@ -25,6 +24,7 @@ from sauna.experiments.inspect.recording import Played, open_env, play_episodes
 from sauna.experiments.inspect.streams import more_plays, scaled, stacked, stream_of
 from sauna.system import run_directory
 from sauna.system.checkpoint import BadCheckpoint
+from sauna.training.artifact import Artifact
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under, unpack_optimizer, unpack_sampler
 

@@ -90,7 +90,7 @@ HEAD = (
     "SNR dropped - shifted",
     "SNR per env step, kept - control",
     "Cosine dropped - control",
-    "Alignment of kept",
+    "Alignment of kept, checkpoints",
     "Variance, kept / control",
     "Raw variance, kept / control",
     "Raw variance, dropped / control",

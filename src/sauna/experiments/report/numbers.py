@@ -31,3 +31,10 @@ def interval(values: Sequence[float | None] | None, digits: int) -> str:
     if values is None or values[0] is None or values[1] is None:
         return number(values[0] if values else None, digits)
     return f"{number(values[0], digits)} [{number(values[1], digits)}, {number(values[2], digits)}]"
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Returns rows of texts as lines whose columns stand under each other."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ("  ".join(f"{t:<{w}}" for t, w in zip(row, widths, strict=True)) for row in rows)
+    return [line.rstrip() for line in lines]

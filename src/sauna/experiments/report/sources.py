@@ -60,8 +60,9 @@ def read_sources(paths: Sequence[Path], tag: str = "") -> list[Source]:
     """Reads every arm of every path; labels that would be alike get their path's name.
 
     Args:
-      paths: run directories; CSV files with the columns seed (optional), step and return; or
-        TensorBoard event files, their folders, or a folder with one such folder for each seed.
+      paths: run directories; CSV files with the columns step, return and, if they have them, arm
+        and seed; or TensorBoard event files, their folders, or a folder with one such folder for
+        each seed.
       tag: of the returns in TensorBoard files; by default the first of `TAGS` that is there.
 
     Raises:
@@ -135,8 +136,8 @@ def _of_rows(rows: list[dict[str, Any]]) -> Curve:
 
 
 def _read_csv(path: Path) -> list[Source]:
-    """The seeds of a CSV file; lines that begin with # are left out."""
-    points: dict[int, list[tuple[float, float]]] = {}
+    """The arms (all is one without a column `arm`) and seeds of a CSV file, without # lines."""
+    points: dict[str, dict[int, list[tuple[float, float]]]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(line for line in file if not line.startswith("#"))
@@ -145,10 +146,13 @@ def _read_csv(path: Path) -> list[Source]:
             for number, row in enumerate(reader, 1):
                 if row[value]:
                     seed, point = _point(path, number, row, step, value)
-                    points.setdefault(seed, []).append(point)
+                    arm = row.get("arm") or path.stem
+                    points.setdefault(arm, {}).setdefault(seed, []).append(point)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: cannot be read ({error})") from error
-    return [Source(path.stem, "", "", path, {}, _curves(path, points))]
+    if not points:
+        raise BadInput(f"{path}: no row has a return")
+    return [Source(arm, "", "", path, {}, _curves(path, own)) for arm, own in points.items()]
 
 
 def _column(path: Path, names: Any, known: tuple[str, ...]) -> str:

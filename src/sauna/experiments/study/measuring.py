@@ -23,6 +23,7 @@ from sauna.experiments.study.spec import Spec, check
 from sauna.experiments.study.units import Unit, parts
 from sauna.system import run_directory
 from sauna.system.checkpoint import numbered
+from sauna.system.safe_write import own_folder
 
 SETTINGS = ("threshold", "threshold_schedule", "keep_rate_target")  # that a cell is known by
 
@@ -161,7 +162,7 @@ def measure(
     waiting = [item for item in items if not item.is_done]
     if not waiting or stopping():
         return
-    measurement.folder(place).mkdir(exist_ok=True)
+    own_folder(measurement.folder(place))
     say(f"measuring {measurement.name}: {len(waiting)} members")
     messages: queue.SimpleQueue[tuple[Item, Message | None]] = queue.SimpleQueue()
     running: dict[Path, UnitProcess] = {}

@@ -17,6 +17,7 @@ from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, to_json
 from sauna.experiments.study.spec import Arm, Spec, check
 from sauna.system import run_directory
+from sauna.system.safe_write import own_folder
 
 SEEDS = 3  # per unit: members of one process share the cost of each vector step
 RULES = 1  # to be raised when a default changes, so that runs of before are not taken for new ones
@@ -130,7 +131,7 @@ def split(unit: Unit) -> list[Unit]:
 
 def mark_split(unit: Unit, folder: Path) -> None:
     """Notes that the unit's seeds are trained one by one from now on."""
-    (folder / unit.name).mkdir(parents=True, exist_ok=True)
+    own_folder(folder / unit.name)
     run_directory.write_json(folder / unit.name / "split.json", {"seeds": list(unit.seeds)})
 
 

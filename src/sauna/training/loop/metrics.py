@@ -9,6 +9,7 @@ import numpy as np
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.envs.info import info_key
 
 if TYPE_CHECKING:
     from sauna.algorithm.learner.metrics import UpdateMetrics
@@ -52,6 +53,8 @@ def metrics_row(
     if config.gae_over == "kept" and counters.reported_returns:
         # The released code logs only episodes whose last step was kept.
         row["return_mean_reported"] = float(np.mean(counters.reported_returns))
+    for name, number in collected.info.items():
+        row[info_key(name)] = number
     scalars = learned._asdict() | learned.work._asdict()
     for name, value in scalars.items():
         if name not in ("finite", "work") and math.isfinite(value):

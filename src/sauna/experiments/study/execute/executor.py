@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from sauna.experiments.study.units import Unit, mark_split, parts, split
 from sauna.system import run_directory
+from sauna.system.safe_write import own_folder
 
 ATTEMPTS = 2  # a failed unit is continued once
 
@@ -122,6 +123,6 @@ class Executor(ABC):
         waiting[:] = [other for other in waiting if other.name != unit.name]
 
     def _give_up(self, unit: Unit, error: str) -> None:
-        (self._folder / unit.name).mkdir(parents=True, exist_ok=True)
+        own_folder(self._folder / unit.name)
         run_directory.write_json(self._folder / unit.name / "failed.json", {"error": error})
         self._view.ended(unit, error)

@@ -9,6 +9,7 @@ from pathlib import Path
 from sauna.experiments.study.execute.executor import Executor, View
 from sauna.experiments.study.execute.process import Message, UnitProcess
 from sauna.experiments.study.units import Unit
+from sauna.system.safe_write import own_folder
 
 
 class LocalExecutor(Executor):
@@ -21,8 +22,7 @@ class LocalExecutor(Executor):
         self._errors: dict[str, str] = {}
 
     def _start(self, unit: Unit) -> None:
-        place, name = self._folder / unit.name, unit.name
-        place.mkdir(parents=True, exist_ok=True)
+        place, name = own_folder(self._folder / unit.name), unit.name
         self._processes[name] = UnitProcess(
             unit.overrides(self._folder),
             place / "stderr.txt",

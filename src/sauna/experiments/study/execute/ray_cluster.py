@@ -19,12 +19,14 @@ from pathlib import Path
 from typing import IO, Any
 
 from sauna import __version__
+from sauna.config.trust import seal
 from sauna.experiments.study.execute import ray_files
 from sauna.experiments.study.execute.executor import Executor, View
 from sauna.experiments.study.execute.ray_node import Hub, Said, run_unit, version
 from sauna.experiments.study.units import Unit
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError, one_line
+from sauna.system.safe_write import own_folder
 
 RETRIES = 5  # by Ray, of a task whose node or process was lost; then it counts as failed
 TOKENS = (
@@ -156,7 +158,7 @@ class RayExecutor(Executor):
 
     def _start(self, unit: Unit) -> None:
         run = unit.run(self._folder)
-        run.mkdir(parents=True, exist_ok=True)
+        own_folder(run)
         try:
             self._locks[unit.name] = run_directory.lock(run)
         except (
@@ -166,7 +168,9 @@ class RayExecutor(Executor):
             return
         overrides = unit.overrides(self._folder)
         task = self._task.options(num_gpus=1) if overrides.get("device") == "gpu" else self._task
-        self._tasks[task.remote(self._hub, unit.name, overrides, self._git)] = unit.name
+        # The run is this user's: a node has another key, which says nothing here.
+        recorded = {"out": overrides["out"], "git": self._git, "seal": seal(overrides)}
+        self._tasks[task.remote(self._hub, unit.name, overrides, recorded)] = unit.name
 
     def _pump(self) -> None:
         if not self._tasks:

@@ -12,11 +12,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from sauna.system import run_directory, safe_write
+from sauna.system import metrics_csv, run_directory, safe_write
 
 LOGS = ("stderr.txt", *(f"run/{name}" for name in run_directory.LOGS))
 CHECKPOINTS = "run/checkpoints"
 LAST = "run/summary.json"  # says that everything else is there
+TABLE = f"run/{metrics_csv.NAME}"  # rewritten while it grows: sent when all is done
 
 
 class Changes(NamedTuple):
@@ -31,7 +32,8 @@ def names(place: Path) -> list[str]:
     """Returns the files of the unit in `place`, without those that are being written."""
     found = [place / "stderr.txt", *sorted((place / "run").rglob("*"))]
     relative = [path.relative_to(place) for path in found if path.is_file()]
-    return [str(r) for r in relative if not any(part.startswith(".") for part in r.parts)]
+    own = [str(r) for r in relative if not any(part.startswith(".") for part in r.parts)]
+    return [name for name in own if name != TABLE or LAST in own]
 
 
 def read(place: Path, chosen: list[str]) -> dict[str, bytes]:

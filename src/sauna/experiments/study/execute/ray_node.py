@@ -88,14 +88,14 @@ class Hub:
         self._stopping = True
 
 
-def run_unit(hub: Any, name: str, overrides: dict[str, Any], git: str | None) -> str:
+def run_unit(hub: Any, name: str, overrides: dict[str, Any], recorded: dict[str, Any]) -> str:
     """Trains or continues a unit.
 
     Args:
       hub: the actor.
       name: of the unit.
       overrides: the settings of its run on the study's machine.
-      git: the study's revision.
+      recorded: what its config says of the study's machine: `out`, `git` and `seal`.
 
     Returns:
       how it ended: a reason only if its run is not complete.
@@ -109,7 +109,6 @@ def run_unit(hub: Any, name: str, overrides: dict[str, Any], git: str | None) ->
         place = Path(folder)
         write(place, files)
         unit = overrides | {"out": str(place / "run")}
-        recorded = {"out": overrides["out"], "git": git}
         unit["elsewhere"] = {"recorded": recorded, "folder": folder}
         return _train(place, unit, lambda *said: ray.get(hub.say.remote(name, attempt, *said)))
 

@@ -33,7 +33,7 @@ from sauna.training import run as runs
 from sauna.training.train import train_run
 
 PATIENCE = 300.0  # seconds that a run may still be locked by a process that is ending
-SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate")
+SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate", "sample_rate")
 
 
 class LineDisplay:
@@ -96,17 +96,18 @@ def train(overrides: dict[str, Any], elsewhere: dict[str, Any], display: LineDis
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.5)
-    if elsewhere and not resume:
-        _record(run, elsewhere["recorded"])
+    if elsewhere:
+        _record(run, elsewhere["recorded"], resume)
     train_run(run, display, resume=resume)
 
 
-def _record(run: runs.Run, recorded: dict[str, Any]) -> None:
-    """Notes places and revision as on the study's machine, where the run is kept."""
+def _record(run: runs.Run, recorded: dict[str, Any], resume: bool) -> None:
+    """Notes place, revision and seal of the study's machine, where the run is kept."""
     stored = run_directory.read_config(run.path)
-    stored["git"] = recorded.pop("git")
-    run.prepared = run.prepared._replace(run=run.prepared.run.replace(**recorded))
-    run_directory.write_json(run.path / "config.json", {**stored, **to_stored(run.prepared.run)})
+    if not resume:
+        run.prepared = run.prepared._replace(run=run.prepared.run.replace(out=recorded["out"]))
+        stored |= {**to_stored(run.prepared.run), "git": recorded["git"]}
+    run_directory.write_config(run.path, {**stored, "seal": recorded["seal"]})
 
 
 def main() -> int:

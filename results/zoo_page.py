@@ -1,0 +1,133 @@
+"""`docs/results/zoo.md`: what `sauna train ENV` gives, beside RL Zoo's published returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from studies import listed, load, markdown, page
+
+from sauna.config.zoo import ENVS, PUBLISHED, entry_of, shown_published
+from sauna.experiments.report import style
+
+COLUMNS = 4  # panels side by side
+# Why a return is below the published one by more than its spread, or needs a word.
+WORDS = {
+    "HalfCheetah-v5": "preset `mujoco` is one for all tasks; RL Zoo has tuned numbers.",
+    "Swimmer-v5": "preset `mujoco` has a discount of 0.99; RL Zoo's is 0.9999.",
+}
+
+
+def zoo_page(units: Mapping[str, Any]) -> str:
+    """The page, from the units of `results/zoo.json`."""
+    done = [env for env in ENVS if env in units]
+    missing = [env for env in ENVS if env not in units]
+    below = [f"`{env}`: {_word(env)}" for env in done if _is_below(env, units)]
+    figure = "![Training curves of three seeds each](figures/zoo.svg)\n\n" + CAPTION
+    return page(
+        "zoo",
+        figure=figure if done else "",
+        table=markdown([HEAD, *(_row(env, units[env]) for env in done)]),
+        words=listed(below) if below else "None so far.",
+        seconds=_seconds(),
+        missing=markdown(
+            [["Environment", "Preset", "Env steps", "RL Zoo"], *map(_missing, missing)]
+        ),
+    )
+
+
+CAPTION = """*Training return of the last 100 episodes (actions sampled), three seeds. Grey:
+the return and the spread that RL Zoo publishes.*"""
+HEAD = [
+    "Environment",
+    "Preset",
+    "Env steps",
+    "Return of each seed",
+    "Mean and spread",
+    "RL Zoo",
+    "Minutes",
+]
+
+
+def _row(env: str, unit: Mapping[str, Any]) -> list[str]:
+    returns = list(unit["returns"].values())
+    digits = 1 if max(map(abs, returns)) >= 10 else 3
+    return [
+        f"`{env}`",
+        f"`{unit['preset']}`",
+        f"{unit['steps']:,}",
+        ", ".join(f"{value:,.{digits}f}" for value in returns),
+        f"{np.mean(returns):,.{digits}f} ± {np.std(returns, ddof=1):,.{digits}f}",
+        _published(env),
+        f"{unit['wall_seconds'] / 60:.1f}",
+    ]
+
+
+def _published(env: str) -> str:
+    return shown_published(env).replace("+-", "±") or "-"
+
+
+def _missing(env: str) -> list[str]:
+    entry = entry_of(env)
+    assert entry is not None
+    return [f"`{env}`", f"`{entry.preset}`", f"{entry.steps:,}", _published(env)]
+
+
+def _is_below(env: str, units: Mapping[str, Any]) -> bool:
+    """Whether the mean of the seeds is below the published one by more than the larger spread."""
+    published, returns = PUBLISHED.get(env), list(units[env]["returns"].values())
+    if published is None:
+        return False
+    return np.mean(returns) < published.mean - max(published.std, np.std(returns, ddof=1))
+
+
+def _word(env: str) -> str:
+    return WORDS.get(env, "**not explained yet**.")
+
+
+def _seconds() -> str:
+    """Training seconds beside Stable-Baselines3's; empty if they were not measured."""
+    found = load("zoo_seconds")
+    if not found:
+        return ""
+    rows = [["Environment", "Seconds here", "Seconds, SB3", "Return here", "Return, SB3"]]
+    for env, pair in found["tasks"].items():
+        numbers = [pair[side][name] for name in ("seconds", "return") for side in ("ours", "sb3")]
+        rows.append([f"`{env}`", *(f"{number:,.1f}" for number in numbers)])
+    text = (
+        f"## Seconds beside Stable-Baselines3\n\nThe same numbers, {found['seeds']} seeds of "
+        f"{found['steps']:,} env steps, two processes, one side after the other. Seconds are those "
+        "from the command to its end, with imports and compilation. A return is the mean training "
+        "return of the last 100 episodes."
+    )
+    return f"{text}\n\n{markdown(rows)}"
+
+
+def draw_zoo(units: Mapping[str, Any], path: Path) -> Path:
+    """Draws the training curves of every unit, with RL Zoo's return as a line and a band."""
+    from matplotlib.figure import Figure
+
+    done = [env for env in ENVS if env in units]
+    rows = -(-len(done) // COLUMNS)
+    look = style.looks({"ppo": "ppo"})["ppo"]
+    with style.applied():
+        figure = Figure(figsize=(3.2 * COLUMNS, 2.2 * rows), layout="tight")
+        panels = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+        for axes, env in zip(panels, done, strict=False):
+            lines = [curve["return"] for curve in units[env]["curves"].values()]
+            if published := PUBLISHED.get(env):
+                low, high = published.mean - published.std, published.mean + published.std
+                axes.axhspan(low, high, color="#999999", alpha=0.2, linewidth=0)
+                axes.axhline(published.mean, color="#666666", linewidth=0.8)
+                lines.append([published.mean])
+            for curve in units[env]["curves"].values():
+                axes.plot(curve["env_steps"], curve["return"], color=look.colour, linewidth=1.2)
+            style.fit_axes(axes, lines)
+            axes.set_title(env)
+            axes.xaxis.set_major_formatter(style.short)
+        for axes in panels[len(done) :]:
+            axes.set_axis_off()
+        path.write_bytes(style.as_svg(figure))
+    return path

@@ -1,0 +1,173 @@
+"""Presets made for single tasks, and for environments of which only the spaces are known.
+
+"RL Zoo" is DLR-RM/rl-baselines3-zoo, `hyperparams/ppo.yml` at revision 22e3ff2. A comment says what
+differs from its numbers; without one, nothing does. Two things always differ: RL Zoo's gSDE
+(exploration that depends on the state) is left out, and `value_coef` is twice its `vf_coef`, as the
+value loss here has a factor 0.5.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+# Stable-Baselines3's defaults of PPO, as far as they differ from ours.
+_SB3: dict[str, Any] = {
+    "learning_rate_schedule": "constant",
+    "clip_value": False,
+    "value_coef": 1.0,
+    "normalize_observations": False,
+    "normalize_rewards": False,
+}
+_NORMALIZED = {**_SB3, "normalize_observations": True, "normalize_rewards": True}
+_MINIGRID = {
+    **_NORMALIZED,
+    "envs": 8,
+    "rollout_steps": 128,
+    "minibatches": 16,
+    "epochs": 10,
+    "learning_rate": 2.5e-4,
+}
+_BIPEDAL = {**_NORMALIZED, "rollout_steps": 2048, "epochs": 10}
+
+TASK_PRESETS: dict[str, dict[str, Any]] = {
+    # Its clip range falls to 0 with the step size; here it stays.
+    "cartpole": {
+        **_SB3,
+        "envs": 8,
+        "rollout_steps": 32,
+        "minibatches": 1,
+        "epochs": 20,
+        "learning_rate": 1e-3,
+        "learning_rate_schedule": "linear",
+        "gamma": 0.98,
+        "gae_lambda": 0.8,
+    },
+    "acrobot": {
+        **_NORMALIZED,
+        "envs": 16,
+        "rollout_steps": 256,
+        "minibatches": 64,
+        "epochs": 4,
+        "gae_lambda": 0.94,
+    },
+    "mountain-car": {
+        **_NORMALIZED,
+        "envs": 16,
+        "rollout_steps": 16,
+        "minibatches": 4,
+        "epochs": 4,
+        "gae_lambda": 0.98,
+    },
+    # Own numbers. RL Zoo's need gSDE. The goal is found by chance alone: actions of a wide normal
+    # distribution are mostly full force, of which one episode in five or so reaches it.
+    "mountain-car-continuous": {
+        "envs": 8,
+        "rollout_steps": 256,
+        "minibatches": 32,
+        "log_std_init": 1.0,
+        "gamma": 0.999,
+        "clip_value": False,
+    },
+    "pendulum": {
+        **_SB3,
+        "envs": 4,
+        "rollout_steps": 1024,
+        "minibatches": 64,
+        "epochs": 10,
+        "learning_rate": 1e-3,
+        "gamma": 0.9,
+    },
+    "lunar-lander": {
+        **_SB3,
+        "envs": 16,
+        "rollout_steps": 1024,
+        "minibatches": 256,
+        "epochs": 4,
+        "gamma": 0.999,
+        "gae_lambda": 0.98,
+        "entropy_coef": 0.01,
+    },
+    "bipedal-walker": {
+        **_BIPEDAL,
+        "envs": 32,
+        "minibatches": 1024,
+        "gamma": 0.999,
+        "clip_range": 0.18,
+    },
+    # Its clip range falls to 0 with the step size; here it stays.
+    "bipedal-walker-hardcore": {
+        **_BIPEDAL,
+        "envs": 16,
+        "minibatches": 512,
+        "learning_rate": 2.5e-4,
+        "learning_rate_schedule": "linear",
+        "entropy_coef": 0.001,
+    },
+    # RL Zoo repeats each action twice, and learns from two grey pictures of 64 x 64 pixels by GELU
+    # layers of 256 units. Here: every picture as it comes, 96 x 96 in colour, and the Nature CNN.
+    "car-racing": {
+        **_SB3,
+        "envs": 8,
+        "rollout_steps": 512,
+        "minibatches": 32,
+        "epochs": 10,
+        "learning_rate": 1e-4,
+        "learning_rate_schedule": "linear",
+        "log_std_init": -2.0,
+        "normalize_rewards": True,
+        "trunk": "shared",
+    },
+    "minigrid": _MINIGRID,
+    # The tasks of which RL Zoo's rollouts are longer.
+    "minigrid-long": {**_MINIGRID, "rollout_steps": 512, "minibatches": 64},
+    # Own numbers: many environments for the accelerator; the discount, the step size and the
+    # entropy bonus are those of MuJoCo Playground's `dm_control_suite_params.py` (d5e6b47).
+    "playground": {
+        "envs": 2048,
+        "rollout_steps": 64,
+        "minibatches": 32,
+        "epochs": 4,
+        "learning_rate": 1e-3,
+        "learning_rate_schedule": "constant",
+        "gamma": 0.995,
+        "entropy_coef": 0.01,
+        "hidden": (256, 256),
+    },
+    # Own numbers: preset `mujoco` on eight environments.
+    "robotics": {"envs": 8, "rollout_steps": 256},
+    # Of an unknown environment: preset `mujoco`, which makes one copy of it, and what its spaces or
+    # its time limit ask for besides. A longer rollout sees several of its episodes.
+    "discrete": {"entropy_coef": 0.01},
+    "long-horizon": {"rollout_steps": 8192, "minibatches": 128, "gamma": 0.999},
+    # Preset `atari` without what is special to Atari: the size of rewards is kept.
+    "pictures": {
+        "envs": 8,
+        "rollout_steps": 128,
+        "minibatches": 4,
+        "epochs": 4,
+        "learning_rate": 2.5e-4,
+        "clip_range": 0.1,
+        "entropy_coef": 0.01,
+        "value_coef": 1.0,
+        "trunk": "shared",
+    },
+}
+
+TASK_PRESET_HELP = {
+    "cartpole": "CartPole with RL Zoo's numbers",
+    "acrobot": "Acrobot with RL Zoo's numbers",
+    "mountain-car": "MountainCar with RL Zoo's numbers",
+    "mountain-car-continuous": "MountainCarContinuous: wide actions at first",
+    "pendulum": "Pendulum with RL Zoo's numbers",
+    "lunar-lander": "LunarLander, both forms, with RL Zoo's numbers",
+    "bipedal-walker": "BipedalWalker with RL Zoo's numbers",
+    "bipedal-walker-hardcore": "BipedalWalkerHardcore with RL Zoo's numbers",
+    "car-racing": "CarRacing with RL Zoo's numbers, on single pictures in colour",
+    "minigrid": "MiniGrid with RL Zoo's numbers",
+    "minigrid-long": "the same with rollouts of 512 steps (FourRooms, RedBlueDoors)",
+    "playground": "MuJoCo Playground's control tasks: 2048 environments on an accelerator",
+    "robotics": "dense reaching tasks of Gymnasium-Robotics: eight environments",
+    "discrete": "discrete actions: as mujoco, with an entropy bonus",
+    "long-horizon": "episodes of more than 1000 steps: rollouts of 8192 steps, discount 0.999",
+    "pictures": "pictures: Nature CNN, eight environments",
+}

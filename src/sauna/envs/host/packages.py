@@ -1,0 +1,61 @@
+"""Environments of other packages, each an extra, which are known by their ids alone."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from typing import Any, NamedTuple
+
+from sauna.system.errors import BadInput
+
+
+class Package(NamedTuple):
+    """A package that registers environments with Gymnasium when it is imported."""
+
+    pattern: str  # of its ids
+    module: str
+    extra: str  # of ours, which installs it
+    examples: str  # of its ids, for a list
+
+
+PACKAGES = (
+    Package(r"(?:MiniGrid|BabyAI)-.+", "minigrid", "minigrid", "MiniGrid-..., BabyAI-..."),
+    Package(
+        r"(?:Adroit|AntMaze_|Fetch|FrankaKitchen|HandManipulate|HandReach|PointMaze_).*-v\d+",
+        "gymnasium_robotics",
+        "robotics",
+        "PointMaze_..., AntMaze_..., FetchReachDense-v4, ...",
+    ),
+)
+
+
+def package_of(name: str) -> Package | None:
+    """Finds the package that has an environment of this id; None if none of ours does."""
+    return next((one for one in PACKAGES if re.fullmatch(one.pattern, name)), None)
+
+
+def register(package: Package, name: str) -> None:
+    """Registers the package's environments.
+
+    Raises:
+      BadInput: it is not installed; the extra that installs it is named.
+    """
+    import gymnasium
+
+    if importlib.util.find_spec(package.module) is None:
+        raise BadInput(f"env: {name} needs `pip install 'sauna-rl[{package.extra}]'`")
+    gymnasium.register_envs(importlib.import_module(package.module))
+
+
+def as_vector(env: Any) -> Any:
+    """MiniGrid's observations as one vector, picture and mission, as RL Zoo has them.
+
+    Any other environment stays as it is.
+    """
+    spaces = getattr(env.observation_space, "spaces", {})
+    if type(spaces.get("mission", None)).__name__ != "MissionSpace":
+        return env
+    from minigrid.wrappers import FlatObsWrapper
+
+    return FlatObsWrapper(env)

@@ -1,0 +1,83 @@
+"""What `sauna list` prints: everything that a setting can name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from sauna.config.presets import (
+    ARM_HELP,
+    CONTROL_HELP,
+    FILTER_HELP,
+    PRESET_HELP,
+    RULE_HELP,
+    TARGET_HELP,
+)
+from sauna.config.settings import NATIVE
+from sauna.config.zoo import ENVS, row_of
+
+HELP = {"arms": ARM_HELP, "presets": PRESET_HELP, "filters": FILTER_HELP, "targets": TARGET_HELP}
+HEAD = ("environment", "preset", "env steps", "RL Zoo's return")
+
+
+def listing(what: str) -> list[str]:
+    """Returns the lines of one list.
+
+    Raises:
+      BadInput: it is the list of a backend that is not installed.
+    """
+    if what == "envs":
+        return list(_envs())
+    if what == "atari":
+        from sauna.envs.host.atari_envs import names
+
+        return names()
+    if what in NATIVE:
+        from sauna.envs.device.make import names_of
+
+        return names_of(what)
+    if what == "rules":
+        return list(_rules())
+    if what == "studies":
+        from sauna.experiments.study.spec import built_in
+
+        texts = ((name, text.splitlines()[0]) for name, text in built_in().items())
+        return [f"{name:10} {first.removeprefix('# ')}" for name, first in texts]
+    width = max(map(len, HELP[what]))
+    lines = [f"{name:{width}}  {text}" for name, text in HELP[what].items()]
+    return lines + (["", "What `sauna train ENV` takes:", *_zoo()] if what == "presets" else [])
+
+
+def _envs() -> Iterator[str]:
+    """Gymnasium's environments, with what the zoo says of them, and where there are more."""
+    import gymnasium
+
+    import sauna.envs.flagrun  # noqa: F401 - registers it
+    from sauna.envs.host.packages import PACKAGES
+
+    yield _columns(HEAD)
+    for name in sorted(gymnasium.registry):
+        yield _columns(row_of(name)) if row_of(name) else name
+    for package in PACKAGES:
+        yield f"{package.examples}  (`pip install 'sauna-rl[{package.extra}]'`)"
+    for backend in NATIVE:
+        yield f"{backend}/...  (on the device; `sauna list {backend}` names them)"
+    yield "ALE/...  (`sauna list atari` names them)"
+
+
+def _zoo() -> Iterator[str]:
+    yield _columns(HEAD)
+    for name in ENVS:
+        yield _columns(row_of(name))
+
+
+def _columns(row: tuple[str, ...]) -> str:
+    env, preset, steps, published = row
+    return f"{env:33} {preset:24} {steps:>11}  {published}".rstrip()
+
+
+def _rules() -> Iterator[str]:
+    for name, text in {**RULE_HELP, **CONTROL_HELP}.items():
+        stage, _, sentence = text.partition(": ")
+        yield f"{name:15} {stage:8} {sentence}"
+    yield ""
+    yield "Join rules by +, such as sauna+avec, and a control to a rule: gigaflow+random"

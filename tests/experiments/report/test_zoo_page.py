@@ -1,0 +1,67 @@
+"""The page of the zoo: each environment beside RL Zoo's return, and what is below it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from zoo import TRAINED, is_done, settings_of, stored
+from zoo_page import draw_zoo, zoo_page
+
+from sauna.config.zoo import ENVS, entry_of
+
+
+def unit(*returns: float) -> dict[str, Any]:
+    names = [f"ppo/{seed}" for seed in range(len(returns))]
+    curve = {"env_steps": [100, 200], "return": [0.0, 1.0]}
+    return {
+        "preset": "lunar-lander",
+        "steps": 1_000_000,
+        "returns": dict(zip(names, returns, strict=True)),
+        "wall_seconds": 90.0,
+        "curves": dict.fromkeys(names, curve),
+    }
+
+
+def below(units: dict[str, Any]) -> str:
+    return zoo_page(units).partition("## Below the published return")[2].partition("\n## ")[0]
+
+
+def test_a_row_holds_the_seeds_their_mean_and_the_published_return() -> None:
+    page = zoo_page({"LunarLander-v3": unit(240.0, 250.0, 260.0)})
+    row = next(line for line in page.splitlines() if line.startswith("| `LunarLander-v3`"))
+    assert row.endswith("| 240.0, 250.0, 260.0 | 250.0 ± 10.0 | 242.1 ± 31.8 | 1.5 |")
+    assert page.index("Not trained here yet") < page.index("| `LunarLanderContinuous-v3`")
+
+
+def test_below_is_a_mean_lower_than_the_published_one_by_more_than_the_larger_spread() -> None:
+    assert "None so far." in below({"LunarLander-v3": unit(211.0, 211.0, 211.0)})
+    assert "not explained yet" in below({"LunarLander-v3": unit(209.0, 209.0, 209.0)})
+    assert "None so far." in below({"LunarLander-v3": unit(209.0, 109.0, 309.0)})
+    assert "0.9999" in below({"Swimmer-v5": unit(100.0, 101.0, 102.0)})
+    assert "None so far." in below({"Humanoid-v5": unit(1.0, 1.0, 1.0)})  # nothing is published
+
+
+def test_a_figure_has_a_panel_for_each_environment(tmp_path: Path) -> None:
+    units = {"LunarLander-v3": unit(1.0, 2.0, 3.0), "Humanoid-v5": unit(1.0, 2.0, 3.0)}
+    text = draw_zoo(units, tmp_path / "zoo.svg").read_text()
+    assert "LunarLander-v3" in text and "Humanoid-v5" in text and "CartPole" not in text
+
+
+def test_a_unit_is_done_only_with_todays_settings(monkeypatch, tmp_path: Path) -> None:
+    entry = entry_of("LunarLander-v3")
+    assert entry is not None and set(TRAINED) <= set(ENVS)
+    file = tmp_path / "zoo.json"
+    monkeypatch.setattr("zoo.FILE", file)
+    assert not is_done("LunarLander-v3", entry)
+    for settings, done in ((settings_of(entry), True), ({"steps": 1}, False)):
+        units = {"LunarLander-v3": {**unit(1.0), "settings": settings}}
+        file.write_text(json.dumps({"units": units}))
+        assert is_done("LunarLander-v3", entry) is done
+
+
+def test_the_page_is_that_of_the_result_file() -> None:
+    """If this fails, run `python results/make.py`."""
+    root = Path(__file__).parents[3]
+    assert (root / "docs" / "results" / "zoo.md").read_text() == zoo_page(stored())
