@@ -16,7 +16,6 @@ import pytest
 import sauna
 from algorithm.selection import oracle, oracle_loss
 from arrays import hypers, random_rollout
-from faults.canned import trained_here
 from helpers import SMALL, configured
 from sauna.algorithm.learner.program import Learner, make_learner, make_parts
 from sauna.algorithm.learner.update import Parts
@@ -29,6 +28,7 @@ from sauna.experiments.inspect.inspection import Inspection, examine
 from sauna.experiments.inspect.learned import Learned, draws_of, learned, reads_rollouts
 from sauna.experiments.inspect.page import notes, page_data
 from sauna.training.artifact import load_artifact
+from threads import trained_here
 
 STEPS, ENVS, ROLLOUTS, SEED, ITERATION = 12, 2, 2, 5, 3
 ROWS = STEPS * ENVS
