@@ -131,7 +131,7 @@ def mask_of(sampler: str, made: Asked, rollout: Rollout) -> np.ndarray:
 @pytest.mark.parametrize(
     "arm, sampler",
     [
-        ("kondo", "kondo"),
+        pytest.param("kondo", "kondo", marks=slow),
         pytest.param("top-advantage", "top-advantage", marks=slow),
         pytest.param("pods", "pods", marks=slow),
         pytest.param("vex-oracle", "vex-oracle", marks=slow),
@@ -203,6 +203,7 @@ def test_the_control_of_a_filter_takes_as_many_steps_as_it_keeps() -> None:
     assert found.taken[0] and not np.array_equal(found.taken, kept)
 
 
+@slow
 def test_delight_weighs_by_advantage_times_surprisal() -> None:
     made, first = asked("delight"), []
     for rollout in rollouts(made):
