@@ -155,13 +155,31 @@ def check_rules(config: Config) -> None:
         for name, plain in unfit:
             if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
                 raise BadInput(f"{name}: needs gae_over=all")
-    if config.algorithm == "a2c" and config.stop != "none":
-        raise BadInput("stop: A2C makes one pass, which nothing stops early")
+    check_passes(config)
+    if config.normalize_over == "kept" and config.sampler == "none":
+        raise BadInput("normalize_over: kept needs a sampler; without one it is rollout")
     if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
         raise BadInput(
             "objective: unclipped needs a stop rule (espo) or a loss_weight "
             "(sample-dropout): nothing else bounds the ratio"
         )
+
+
+def check_passes(config: Config) -> None:
+    """Refuses rules that need a ratio other than 1, or a second epoch, where there is none.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.algorithm == "a2c":
+        if config.stop != "none":
+            raise BadInput("stop: A2C makes one pass, which nothing stops early")
+        if config.objective != "clip":
+            raise BadInput(f"objective: {config.objective} needs a ratio, which A2C has none of")
+        if config.loss_weight == "sample-dropout":
+            raise BadInput("loss_weight: sample-dropout needs a ratio other than 1; A2C's is 1")
+    if config.recompute_advantages and (config.algorithm == "a2c" or config.epochs == 1):
+        raise BadInput("recompute_advantages: needs more than one epoch")
 
 
 def local_parts(config: Config) -> list[str]:

@@ -109,9 +109,11 @@ class Config(RunOptions):
         read_when=readers.PPO,
     )
     clip_value: bool = _learning(
-        True, "clip the value function's change as the ratio's", read_when=readers.PPO
+        True, "clip the value function's change as the ratio's", read_when=readers.SQUARED
     )
-    normalize_advantages: bool = _learning(True, "standardise the advantages of each minibatch")
+    normalize_advantages: bool = _learning(
+        True, "standardise the advantages of each minibatch", read_when=readers.CENTRED
+    )
     entropy_coef: float = _learning(
         0.0, "weight of the entropy bonus", at_least=0, shapes_program=False
     )
@@ -201,8 +203,8 @@ class Config(RunOptions):
     )
     selection_mode: str = _selection(
         "fewer",
-        "fewer gradient steps on minibatches of the same size, as many steps on smaller ones, or "
-        "as many of the same size, refilled with what was taken",
+        "fewer gradient steps on minibatches of PPO's size (or as near below it as fills them), as "
+        "many steps on smaller ones, or as many of PPO's size, refilled with what was taken",
         choices=("fewer", "smaller", "refill"),
         read_when=readers.MASKED,
     )
@@ -227,6 +229,7 @@ class Config(RunOptions):
         "clip",
         "the policy term: PPO's clip, SPO's penalty, or neither",
         choices=("clip", "spo", "unclipped"),
+        plugin=True,
         read_when=readers.PPO,
     )
     loss_weight: str = _update(
@@ -252,6 +255,7 @@ class Config(RunOptions):
         "squared",
         "the value loss: squared errors, or their variance (AVEC)",
         choices=("squared", "avec"),
+        plugin=True,
     )
     recompute_advantages: bool = _update(
         False, "compute values and advantages anew before each epoch", read_when=readers.PPO

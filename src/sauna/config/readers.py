@@ -41,10 +41,21 @@ RANDOM = ("filter random-drop", lambda c: c.filter == "random-drop")
 OWN_FILTER = ("a filter of your own, module:name", lambda c: ":" in c.filter)
 SAMPLER = ("a sampler", lambda c: c.sampler != "none")
 MASKED = (
-    "a sampler, or a filter with dropped=mask",
-    lambda c: c.sampler != "none" or (c.filter != "none" and c.dropped == "mask"),
+    "a sampler with selection_losses=all, or a filter with dropped=mask",
+    lambda c: (
+        (c.sampler != "none" and c.selection_losses == "all")
+        or (c.filter != "none" and c.dropped == "mask")
+    ),
 )
-STANDARDISED = ("normalize_advantages", lambda c: c.normalize_advantages)
+CENTRED = ("advantage_sign both", lambda c: c.advantage_sign == "both")
+STANDARDISED = (
+    "normalize_advantages, or advantage_sign positive",
+    lambda c: c.normalize_advantages or c.advantage_sign == "positive",
+)
+SQUARED = (
+    "algorithm ppo with critic squared",
+    lambda c: c.algorithm == "ppo" and c.critic == "squared",
+)
 WEIGHTED = ("a loss_weight", lambda c: c.loss_weight != "none")
 STOPPED = ("a stop rule", lambda c: c.stop != "none")
 UNSCHEDULED = ("constant", "kl")  # schedules that do not follow the budget

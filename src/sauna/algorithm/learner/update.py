@@ -149,8 +149,11 @@ def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
     return generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)
 
 
-def device_minibatch_order(config: Config, key: Array) -> Array:
-    """The order of the samples in every epoch `[epochs, T * N]`."""
-    number = config.rollout_steps * config.envs
+def device_minibatch_order(config: Config, key: Array, length: int | None = None) -> Array:
+    """The order of the samples in every epoch `[epochs, T * N]`, or of the first `length` rows.
+
+    A permutation is a sort here, so that one of fewer rows takes less time.
+    """
+    number = length or config.rollout_steps * config.envs
     keys = jax.random.split(key, config.epochs)
     return jax.vmap(lambda key: jax.random.permutation(key, number))(keys)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import MAX_STEPS
@@ -29,7 +28,7 @@ class Episode(NamedTuple):
 
 
 def play(
-    policy: FrozenPolicy,
+    policy: Callable[..., Any],
     env: Any,
     deterministic: bool,
     seed: int,
@@ -39,6 +38,7 @@ def play(
     """Plays one episode, cut after `max_steps` env steps.
 
     Args:
+      policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes.
       watch: called after the reset and after each env step.
     """
     key = jax.random.key(seed)
