@@ -1,9 +1,14 @@
-"""What the live table shows: what one looks for with PPO, and what a rule or a head has."""
+"""What a run shows: the columns of its table, and the lines where there is no terminal."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
 from sauna.config.presets import resolve_run
-from sauna.training.display import columns_of
+from sauna.training import display
+from sauna.training.display import PlainDisplay, columns_of, counted, returns
 
 
 def titles(**settings: object) -> list[str]:
@@ -15,9 +20,53 @@ def test_plain_ppo_shows_no_head_and_no_rule() -> None:
     shown = titles(arm="ppo")
     assert shown[:4] == ["env steps", "episodes", "return", "length"]
     assert {"entropy", "KL", "expl. var."} <= set(shown)
-    assert not {"keep rate", "sample rate", "Vex mean"} & set(shown)
+    assert not {"keep rate", "samples used", "Vex mean"} & set(shown)
 
 
 def test_a_rule_shows_what_it_takes() -> None:
     assert {"keep rate", "Vex mean", "Vex spread"} <= set(titles(arm="sauna"))
-    assert "sample rate" in titles(arm="gigaflow")
+    assert "samples used" in titles(arm="gigaflow")
+
+
+def row(member: str, env_steps: int) -> dict[str, object]:
+    return {"member": member, "env_steps": env_steps, "return_mean": 1.5}
+
+
+def test_plain_lines_name_each_phase_once_and_never_repeat(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """200 seconds of compiling, then an iteration every 5 seconds, for a minute."""
+    now = [0.0]
+    monkeypatch.setattr(display.time, "monotonic", lambda: now[0])
+    run = resolve_run({"env": "none", "arm": "ppo", "seeds": 2, "steps": 20_000})
+    shown = PlainDisplay()
+    shown.open(run.config, run.members, Path("runs/mine"), [])
+    for process in range(2):
+        shown.phase(process, "compiling")
+    while now[0] < 200:
+        now[0] += 1
+        shown.refresh()
+    waited = capsys.readouterr().out.splitlines()
+    assert waited[0].startswith("none: 2 members (ppo x 2 seeds), 20,000 env steps each")
+    assert waited[1] == "0:00 compiling"
+    assert [line.split()[0] for line in waited[2:]] == ["0:10", "0:30", "1:10", "2:30"]
+    for iteration in range(1, 13):
+        now[0] += 5
+        shown.rows([row(f"ppo/{seed}", 1000 * iteration) for seed in range(2)])
+        shown.refresh()
+    trained = capsys.readouterr().out.splitlines()
+    assert trained[-1] == ("4:15 55%, 400 env steps/s, 0:45 left; return: ppo/0 1.5, ppo/1 1.5")
+    assert len(trained) == len(set(trained)) == 6
+
+
+def test_many_members_are_summed_up_by_arm() -> None:
+    latest = {f"{arm}/{seed}": None for arm in ("ppo", "sauna+random") for seed in range(4)}
+    assert returns(latest) == "mean return: ppo -, sauna+random -"
+    latest |= {f"ppo/{seed}": {"return_mean": 2.0 * seed} for seed in (0, 1)}
+    assert returns(latest) == "mean return: ppo 1.0, sauna+random -"
+    few = dict(list(latest.items())[:3])
+    assert returns(few) == "return: ppo/0 0.0, ppo/1 2.0, ppo/2 -"
+
+
+def test_one_is_singular() -> None:
+    assert [counted(n, "task") for n in (0, 1, 2000)] == ["0 tasks", "1 task", "2,000 tasks"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +13,7 @@ from sauna.config.settings import Config
 from sauna.training.summary import with_evaluation
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
+NAMED = 6  # members that a progress line names; of more it gives the mean of each arm
 
 
 class Display(Protocol):
@@ -86,8 +88,10 @@ class _Progress:
             self.config.steps * len(self.latest)
         )
         if self.rate is None:
-            waiting = sorted(set(self.phases.values())) or ["starting"]
-            return ", ".join(waiting) + ("" if share == 0 else f", {share:.0%}")
+            waiting = sorted(set(self.phases.values()))
+            if share > 0:
+                waiting.append(f"{share:.0%}")
+            return ", ".join(waiting) or "starting"
         left = "" if self.seconds_left is None else f", {duration(self.seconds_left)} left"
         return f"{share:.0%}, {self.rate:,.0f} {self.config.budget} steps/s{left}"
 
@@ -99,17 +103,26 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Writes `1 task` or `2 tasks`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def number(row: dict[str, Any] | None, key: str, form: str) -> str:
     """Formats a number of a row; `-` if it is not there."""
     return format(row[key], form) if row and key in row else "-"
 
 
 class PlainDisplay:
-    """Lines of text, one every few seconds."""
+    """Lines of text: one for each phase, then one every few seconds.
+
+    The gap between two lines doubles until there are new rows.
+    """
 
     def __init__(self) -> None:
         self._progress: _Progress | None = None
-        self._shown = time.monotonic()
+        self._start = self._shown = time.monotonic()
+        self._gap = PLAIN_SECONDS
         self._phases: set[str] = set()
 
     def say(self, text: str) -> None:
@@ -124,21 +137,26 @@ class PlainDisplay:
     def phase(self, process: int, text: str) -> None:
         if text not in self._phases:
             self._phases.add(text)
-            self.say(text)
+            self.say(f"{self._elapsed()} {text}")
+
+    def _elapsed(self) -> str:
+        return duration(time.monotonic() - self._start)
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
         assert self._progress is not None
         self._progress.rows(rows)
+        self._gap = PLAIN_SECONDS
 
     def refresh(self) -> None:
         progress = self._progress
-        if progress is None or time.monotonic() - self._shown < PLAIN_SECONDS:
+        if progress is None or time.monotonic() - self._shown < self._gap:
             return
         self._shown = time.monotonic()
-        returns = ", ".join(
-            f"{name} {number(row, 'return_mean', '.1f')}" for name, row in progress.latest.items()
-        )
-        self.say(f"{progress.status()}; return: {returns}")
+        self._gap *= 2
+        if any(progress.latest.values()):
+            self.say(f"{self._elapsed()} {progress.status()}; {returns(progress.latest)}")
+        else:
+            self.say(f"{self._elapsed()} the first iteration is not done yet")
 
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
         for name, row in members.items():
@@ -150,6 +168,23 @@ class PlainDisplay:
 
     def close(self) -> None:
         pass
+
+
+def returns(latest: Mapping[str, dict[str, Any] | None]) -> str:
+    """Writes the returns of the members, or of more than `NAMED` the mean of each arm.
+
+    Args:
+      latest: the newest row of each member, `arm/seed`; None before the first.
+    """
+    if len(latest) <= NAMED:
+        shown = (f"{name} {number(row, 'return_mean', '.1f')}" for name, row in latest.items())
+        return f"return: {', '.join(shown)}"
+    of_arm: dict[str, list[float]] = {}
+    for name, row in latest.items():
+        own = of_arm.setdefault(name.rpartition("/")[0], [])
+        own += [row["return_mean"]] if row and "return_mean" in row else []
+    means = (f"{arm} {sum(v) / len(v):.1f}" if v else f"{arm} -" for arm, v in of_arm.items())
+    return f"mean return: {', '.join(means)}"
 
 
 class LiveDisplay:
@@ -251,7 +286,7 @@ def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str,
     if any(config.filter != "none" for config in configs):
         columns.append(("keep rate", "keep_rate", ".3f"))
     if any(config.sampler != "none" for config in configs):
-        columns.append(("sample rate", "sample_rate", ".3f"))
+        columns.append(("samples used", "sample_rate", ".3f"))
     if any(config.vex_coef > 0 for config in configs):
         columns += [("Vex mean", "vex_mean", ".3f"), ("Vex spread", "vex_spread", ".3f")]
     return columns
@@ -260,8 +295,8 @@ def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str,
 def headline(config: Config, members: list[Member], path: Path) -> str:
     """Says in one line what is trained, and where it is written."""
     return (
-        f"{config.env}: {len(members)} member{'s' if len(members) > 1 else ''} "
-        f"({', '.join(config.arm)} x {len(config.seeds)} seeds), {config.steps:,} "
+        f"{config.env}: {counted(len(members), 'member')} "
+        f"({', '.join(config.arm)} x {counted(len(config.seeds), 'seed')}), {config.steps:,} "
         f"{'env' if config.budget == 'env' else 'kept'} steps each, preset {config.preset}, "
         f"{config.processes} process{'es' if config.processes > 1 else ''}; writing to {path}"
     )
