@@ -242,8 +242,6 @@ class Coordinator:
                 self._display.rows(header["rows"])
                 self._grant()
                 self._flush()
-                if self._callback:
-                    self._grant()
             case "state":
                 self._states[number][header["iteration"]] = message.arrays
                 self._flush()
@@ -265,6 +263,8 @@ class Coordinator:
                 self._due.append((self._iteration, self._logs.counted()))
         while self._due and self._all_states_of(self._due[0][0]):
             self._save(*self._due.pop(0))
+        if self._callback is not None:  # which has seen the rows that the next iteration waits for
+            self._grant()
 
     def _complete(self, iteration: int, messages: Mapping[int, Message]) -> bool:
         """Returns whether every process that runs this iteration has reported it."""

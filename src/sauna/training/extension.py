@@ -77,7 +77,7 @@ def describe_extension(before: Config, after: Config) -> str:
         return text
     named = ", ".join(names)
     if after.schedule_start != before.schedule_start:
-        return f"{text}; {named}: anew from here to the end"
+        return f"{text}; {named}: anew from {after.schedule_start:,} to {after.steps:,}"
     left = 1 - (before.steps - after.schedule_start) / (after.steps - after.schedule_start)
     return (
         f"{text}; {named}: as in a run of {after.steps:,} steps, with {left:.0%} left at "
