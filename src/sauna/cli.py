@@ -260,7 +260,8 @@ def _train(values: dict[str, Any]) -> None:
     if picked.said:
         display.say(picked.said)
     train_and_draw(run, display, resume=False)
-    print(f"learning curve: {run.path}/figures/learning_curve.png")
+    curve = run.path / "figures" / "learning_curve.png"
+    print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
