@@ -127,8 +127,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
-    text = f"what to compare, also module:name of a rule of your own (default {arms}); the first is"
-    text += " the baseline"
+    text = f"what to compare, also your module:rule; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
     text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
     compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
