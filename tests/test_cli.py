@@ -90,7 +90,7 @@ BAD = [
     (["train", WORLD, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
     (["train", WORLD, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
     (["train", WORLD, "--seeds", "1.5"], "seeds: cannot read '1.5' as whole numbers, separated by"),
-    (["train", WORLD, "--env-kwargs", "[1]"], "env_kwargs: cannot read '[1]' as a JSON object"),
+    (["train", WORLD, "--env-kwargs", "[1]"], "cannot read '[1]' as a JSON object, such as '{"),
     (["train", WORLD, "--lr-schedule", "x"], "here it is '--learning-rate-schedule'"),
     (["train", WORLD, "--seed", "1,2"], "seed: cannot read '1,2' as a whole number"),
     (["compare", WORLD, "--ent-coef", "0.1"], "here it is '--entropy-coef'"),

@@ -143,13 +143,14 @@ def compare(
     accept_changed_code: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Does filtering help on `env`? Trains the arms and says what the data support.
+    """Does a selection rule help on `env`? Trains the arms and says what the data support.
 
     The same as `sauna compare`: called again, it continues where it was stopped.
 
     Args:
       env: a Gymnasium id, `module:function`, or a function that another process can import.
-      arms: what to compare; the first is the baseline. `"all"`: a tournament of every rule.
+      arms: what to compare, also `"module:name"` of a rule of your own; the first is the baseline.
+        `"all"`: a tournament of every rule.
       rules: a tournament of ppo and these instead: more seeds only where something is open.
       controls: each arm that chooses samples gets its matched random control.
       out: the folder of runs and results.

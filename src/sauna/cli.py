@@ -121,13 +121,14 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "leave the frames out: needs no renderer"
     inspect.add_argument("--no-frames", action="store_false", dest="frames", help=text)
 
-    text = "does filtering help on ENV? Trains several arms and says what the data support"
+    text = "does a selection rule help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
     text = f"{FIELDS['env'].metadata['help']}; or runs that exist, as `plot` reads them"
     compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
-    text = f"what to compare; the first is the baseline (default {arms})"
+    text = f"what to compare, also module:name of a rule of your own (default {arms}); the first is"
+    text += " the baseline"
     compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
     text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
     compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
@@ -259,7 +260,8 @@ def _train(values: dict[str, Any]) -> None:
     if picked.said:
         display.say(picked.said)
     train_and_draw(run, display, resume=False)
-    print(f"learning curve: {run.path}/figures/learning_curve.png")
+    curve = run.path / "figures" / "learning_curve.png"
+    print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
@@ -366,11 +368,12 @@ def _runs(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
+    from sauna.config.trust import named_code
     from sauna.experiments.study.command import check_study, load_spec, study_command
 
     name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
     spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
-    _run_study(spec, study_command(name, out), **values)
+    _run_study(spec, study_command(name, out, bool(named_code(spec.text))), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:

@@ -24,7 +24,7 @@ from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.system.logs import Logs, check_logs
-from sauna.system.metrics_csv import MetricsCsv
+from sauna.system.metrics_csv import MetricsCsv, trained_seconds
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
 from sauna.system.safe_write import replace_file
 from sauna.system.signals import handled
@@ -74,8 +74,7 @@ class Coordinator:
         self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
         self._empty_updates = EmptyUpdates()
-        self._before = run_directory.rows(run.path)  # of the run that is resumed
-        self._info_names = InfoNames(self._before)
+        self._info_names = InfoNames(run_directory.rows(run.path))
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
@@ -129,7 +128,7 @@ class Coordinator:
           SaunaError: something failed; the last good checkpoint is on disk.
         """
         run = self._run
-        self._display.open(run.config, run.members, run.path, self._before)
+        self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
             self._grant()
             while any(end is None for end in self._ended):
@@ -330,22 +329,14 @@ class Coordinator:
                 self._stopped.setdefault(row["member"], self._iteration + 1)
 
     def _write_summary(self, complete: bool, arrays: Mapping[str, np.ndarray]) -> None:
-        self._csv.sync()
         check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
         members = summarize(run_directory.rows(self._run.path), arrays)
         run_directory.write_json(
             self._run.path / "summary.json",
             {"complete": complete, "metric": METRIC, "members": members},
         )
+        self._csv.sync()
         self._display.summary(members)
-
-
-def trained_seconds(run: Path) -> float:
-    """Counts the seconds that a run has been trained for; of 0.1.0 those of its iterations."""
-    rows = run_directory.rows(run, "timing.jsonl")
-    if rows and "wall_seconds" in rows[-1]:
-        return float(rows[-1]["wall_seconds"])
-    return float(sum(row["seconds"] for row in rows))
 
 
 def lead_for(seconds: float) -> int:

@@ -286,7 +286,7 @@ def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str,
     if any(config.filter != "none" for config in configs):
         columns.append(("keep rate", "keep_rate", ".3f"))
     if any(config.sampler != "none" for config in configs):
-        columns.append(("sample rate", "sample_rate", ".3f"))
+        columns.append(("samples used", "sample_rate", ".3f"))
     if any(config.vex_coef > 0 for config in configs):
         columns += [("Vex mean", "vex_mean", ".3f"), ("Vex spread", "vex_spread", ".3f")]
     return columns

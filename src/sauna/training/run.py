@@ -14,6 +14,7 @@ from typing import IO, Any
 
 from sauna.config.checks import cautions, check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
+from sauna.config.own_sources import newer_sources
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
@@ -256,6 +257,8 @@ def reopen(
             f"{path} was trained with other code: {differs}; --accept-changed-code (in Python "
             f"accept_changed_code=True) goes on with today's"
         )
+    if text := newer_sources(stored.get("code", {}), run.code):
+        display.say(f"warning: {path} was trained with {text}: the rest may differ")
     after = extension(before, changed)
     with disk_errors(path):
         if goes_further(before.config, after.config):

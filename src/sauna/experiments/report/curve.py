@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -12,7 +13,7 @@ import numpy as np
 from sauna.experiments.report import style
 from sauna.experiments.report.sources import Source, read_sources
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, one_line
 
 TRAINING_RETURN = "training return\n(last 100 episodes)"
 EVALUATED = "return: training (last 100 episodes),\nevaluations (dotted)"
@@ -48,7 +49,19 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_curve(run: Path) -> Path | None:
-    """Draws `figures/learning_curve.png` of a run; None if no episode has finished."""
+    """Draws `figures/learning_curve.png` of a run that was trained; None if that is not possible.
+
+    What keeps it from being drawn costs nothing else: the training has ended well.
+    """
+    try:
+        return _draw_run(run)
+    except Exception as error:  # of a disk that is full, or of Matplotlib
+        print(f"warning: no learning curve was drawn: {one_line(error)}", file=sys.stderr)
+        return None
+
+
+def _draw_run(run: Path) -> Path | None:
+    """Draws the curve of a run; None if no episode has finished."""
     rows = run_directory.rows(run)
     curves, evaluations = member_curves(rows), member_curves(rows, "eval_return_mean")
     if not curves:

@@ -24,6 +24,7 @@ METRIC = "mean training return (sampled actions) of the last 100 episodes"
 CURVES = (
     "return_mean",
     "keep_rate",
+    "sample_rate",
     "vex_mean",
     "vex_spread",
     "vex_median",
@@ -151,6 +152,7 @@ def _ended(
         "env_steps": tried,
         "kept_steps": kept,
         "keep_rate": kept / tried if kept is not None and tried else None,
+        "sample_rate": _short(_mean([row["sample_rate"] for row in rows if "sample_rate" in row])),
         "episodes": last.get("episodes"),
         "explained_variance": last.get("explained_variance"),
         **{name: _short(values[-1]) for name, values in compute.items()},
@@ -170,6 +172,10 @@ def _compute(
         "learner_cpu_seconds": cumulated([seconds.get(row.get("iteration", -1)) for row in rows]),
     }
     return {name: values for name, values in found.items() if values[0] is not None}
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 def _short(value: float | None) -> float | None:

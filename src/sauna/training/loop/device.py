@@ -35,7 +35,7 @@ from sauna.training.loop.device_program import (
     MemberState,
     Population,
     Report,
-    is_sound,
+    is_finite,
     make_mesh,
 )
 from sauna.training.loop.evaluation import DevicePlayer, Evaluator, Frozen, stop_named
@@ -159,7 +159,7 @@ def _devices(config: Config) -> list[Any]:
     if found[0].platform != config.device:
         raise BadInput(f"device: JAX uses the {found[0].platform} here, not the {config.device}")
     if wanted > len(found):
-        raise BadInput(f"devices: {wanted} asked for, {len(found)} are there")
+        raise BadInput(f"devices: {wanted} asked for, this machine has {len(found)}")
     return found[:wanted] if wanted else found
 
 
@@ -192,7 +192,7 @@ def _report(
         for p in np.flatnonzero(ran[:, i]).tolist():
             report = jax.tree.map(lambda x: x[i], reports[p])  # noqa: B023
             member = job.members[p]
-            _check_sound(member, first + i, report)
+            _check_finite(member, first + i, report)
             collected = _collected(report)
             before = counters[p].env_steps
             counters[p].add(collected)
@@ -207,8 +207,8 @@ def _report(
     return first + number
 
 
-def _check_sound(member: Member, iteration: int, report: Report) -> None:
-    if is_sound(report):
+def _check_finite(member: Member, iteration: int, report: Report) -> None:
+    if is_finite(report):
         return
     if report.faults.found:
         what = "reward" if report.faults.in_reward else "observation"

@@ -165,7 +165,7 @@ def several(
         i, state, reports, _ = now
         state, report = iterate(state, setting, first + i)
         reports = jax.tree.map(lambda all, x: all.at[i].set(x), reports, report)
-        return i + 1, state, reports, jnp.all(is_sound(report)) & jnp.any(report.ran)
+        return i + 1, state, reports, jnp.all(is_finite(report)) & jnp.any(report.ran)
 
     _, state, reports, _ = jax.lax.while_loop(
         not_last, step, (jnp.int32(0), state, empty, jnp.bool_(True))
@@ -173,7 +173,7 @@ def several(
     return state, reports
 
 
-def is_sound(report: Report) -> Any:
+def is_finite(report: Report) -> Any:
     """Whether every number of an iteration (or of many) is finite."""
     return ~report.ran | (report.learned.finite & ~report.faults.found)
 

@@ -46,7 +46,7 @@ def read_host_rank(text: str) -> HostRank:
 
 
 def join(host: HostRank) -> None:
-    """Waits until all machines are there, once. Before anything else is asked of JAX."""
+    """Waits until all machines have joined, once. Before anything else is asked of JAX."""
     if host.hosts > 1:
         import jax
 
