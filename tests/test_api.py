@@ -91,6 +91,7 @@ def test_rows_hold_every_metric(result) -> None:
         "kl",
         "clip_fraction",
         "gradient_norm",
+        "policy_std",
         "explained_variance",
         "vex_target",
         "vex_mean",
@@ -122,6 +123,8 @@ def test_the_policy_acts_as_in_training(result) -> None:
     observation, _ = world.reset(seed=3)
     arrays = own(artifact.checkpoint.arrays, "sauna/1")
     arrays = {name.removeprefix("/"): value for name, value in arrays.items()}
+    last = [row for row in result.metrics if row["member"] == "sauna/1"][-1]
+    assert last["policy_std"] == pytest.approx(np.exp(arrays["params/log_std"]).mean(), rel=1e-6)
     mean, variance = arrays["observation_moments/mean"], arrays["observation_moments/variance"]
     x = np.clip((observation - mean) / np.sqrt(variance + 1e-8), -10, 10)
     for layer in ("policy_trunk/layer_0", "policy_trunk/layer_1"):
