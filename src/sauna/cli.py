@@ -368,12 +368,11 @@ def _runs(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
-    from sauna.config.trust import named_code
     from sauna.experiments.study.command import check_study, load_spec, study_command
 
     name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
     spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
-    _run_study(spec, study_command(name, out, bool(named_code(spec.text))), **values)
+    _run_study(spec, study_command(name, out, spec.text), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:
