@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.accepted import translate
+from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
 from sauna.config.settings import fields_with
@@ -187,6 +188,7 @@ def resume(
     return Result(run.path)
 
 
+@names_the_folder
 def load(
     path: str | Path,
     member: int | str = 0,

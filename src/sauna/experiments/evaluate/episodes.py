@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
@@ -30,6 +31,7 @@ class VideoFailure(SaunaError):
         self.result = result
 
 
+@names_the_folder
 @kept_folder()
 def evaluate(
     run: str | Path,

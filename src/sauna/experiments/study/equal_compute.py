@@ -15,8 +15,8 @@ ABOUT = (
     "Learner compute is the number of samples through the gradient. The ratio is that of the first "
     "points where the two mean curves reach the baseline's mean final return. The interval is a "
     "percentile bootstrap over seeds, too narrow with few of them; no verdict rests on it. Nothing "
-    "is said of a baseline whose return has not risen by more than its noise, or with one seed. CPU "
-    "seconds leave out the compilation of a run's first iteration, but not of a resumed one."
+    "is said if the baseline has one seed, or a return that has not risen by more than its noise. "
+    "CPU seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
 WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "learner CPU seconds"}
 
