@@ -17,7 +17,7 @@ from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member, load_artifact
 from sauna.experiments.evaluate.play import Episode, Progress, play
-from sauna.experiments.evaluate.video import record_video
+from sauna.experiments.evaluate.video import check_drawn, record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.working_folder import kept_folder
@@ -73,7 +73,8 @@ def evaluate(
       `{"mode", "env", "seed", "members": {name: {"returns", "lengths", "mean", ...}}}`.
 
     Raises:
-      BadInput: no such run, member or checkpoint, impossible numbers, or `env` has other spaces.
+      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces, or a
+        video was asked for and it has no pictures.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
     run = Path.cwd() / run  # an environment may go elsewhere
@@ -94,6 +95,8 @@ def evaluate(
     kwargs = kwargs_of(artifact, env, env_kwargs)
     if env_kwargs:
         result["env_kwargs"] = kwargs
+    if video:
+        check_drawn(result["env"], kwargs)
     made = make_env(result["env"], kwargs)
     check_spaces(artifact, made)
     from sauna.experiments.evaluate.policy import TrainedPolicy  # imports JAX, so after the checks

@@ -91,8 +91,8 @@ def examine(
         env = make_env(config.env, kwargs)
         seen.append(play_steps(policy, env, steps, deterministic, seed, n))
         close(env)
-    value, own_vex = policy.predict(played.observation)
-    vex = np.stack([own_vex, *(policy.predict(x)[1] for x in seen[1:])], 1)
+    value, own_vex = policy.heads(played.observation)
+    vex = np.stack([own_vex, *(policy.heads(x)[1] for x in seen[1:])], 1)
     key = jax.random.fold_in(member_keys(member.seed).filter, iteration)
     none: Any = np.zeros(vex.shape, np.float32)
     observed: Any = np.stack(seen, 1)
@@ -155,7 +155,7 @@ def _stream(
     """The episodes as the collector would hand them on, `[L, 1]`."""
     ends = np.flatnonzero(played.terminated | played.truncated)
     next_value = np.append(value[1:], 0.0).astype(np.float32)
-    next_value[ends] = np.where(played.truncated[ends], policy.predict(played.final)[0], 0.0)
+    next_value[ends] = np.where(played.truncated[ends], policy.heads(played.final)[0], 0.0)
     column: Any = {
         "reward": reward.astype(np.float32),
         "value": value,
