@@ -51,6 +51,9 @@ class Recorder:
     def allowance(self, iteration: int) -> int:
         return 1_000_000 if self.stop is None else max(self.stop - iteration, 0)
 
+    def stopped(self) -> set[str]:
+        return set()
+
     def iteration(self, iteration: int, rows: list[dict], timing: dict) -> None:
         self.rows += rows
 

@@ -63,14 +63,14 @@ def chosen(sampler: Sampler, samples: Samples, state: Any = None, seed: int = 0)
 
 
 def of_present(samples: Samples, *names: str) -> list[np.ndarray]:
-    """Fields of the rows that are there, in float64."""
+    """Fields of the rows that are present, in float64."""
     on = np.asarray(samples.present)
     arrays = [np.asarray(getattr(samples, name))[on] for name in names]
     return [x.astype(np.float64) if x.dtype == np.float32 else x for x in arrays]
 
 
 def spread(samples: Samples, array: np.ndarray) -> np.ndarray:
-    """Puts an array of the rows that are there at their places; 0 or False elsewhere."""
+    """Puts an array of the rows that are present at their places; 0 or False elsewhere."""
     on = np.asarray(samples.present)
     full = np.zeros((len(on), *array.shape[1:]), array.dtype)
     full[on] = array

@@ -10,6 +10,8 @@ unless a module of `tests/` holds them: a test may write another module of the s
 from __future__ import annotations
 
 import dataclasses
+from copy import copy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,8 @@ from sauna.algorithm.rollout.program import Program
 from sauna.config.checks import own_parts
 from sauna.config.settings import FIELDS, Config, fields_with
 from sauna.envs.spaces import Spaces
+from sauna.training.loop import device
+from sauna.training.loop.job import Job
 
 FREE = {*FIELDS} - {*fields_with("shapes_program")} | {"env", "env_kwargs"}
 START = {name: FIELDS[name].default for name in FREE}
@@ -40,6 +44,24 @@ def _key(config: Config, spaces: Spaces) -> Any:
     """Equal for configs whose compiled functions are the same."""
     of_rules = {"steps": config.steps} if config.sampler != "none" else {}
     return dataclasses.replace(config, **{**START, **of_rules}), repr(spaces)
+
+
+def _population(make_population: Any, job: Job) -> Any:
+    """The members of a job on the device, whose program may be compiled already."""
+    config = job.config
+    known = ":" not in config.env or config.env.partition(":")[0] in OURS
+    if not known or _may_change(config) or config.devices > 1 or config.distributed:
+        return make_population(job)
+    key = (*_key(config, job.spaces), config.env, repr(job.env_kwargs))
+    if key not in _made:
+        _made[key] = first = make_population(job)
+        first.compile()
+    new = copy(_made[key])  # with the compiled `_run`, which is of one member
+    assert new._one_by_one
+    new.compile = lambda: 0.0
+    new.number, new._settings = len(job.members), [device._setting(m) for m in job.members]
+    new._state = [new._init(setting) for setting in new._settings]
+    return new
 
 
 def forget() -> None:
@@ -68,3 +90,4 @@ def share_programs() -> None:
         return _made[key][1]
 
     collecting.make_program, learning.make_learner = program, learner
+    device.make_population = partial(_population, device.make_population)

@@ -111,6 +111,7 @@ def _default(name: str) -> str:
         default = ",".join(map(str, default))
     if isinstance(default, bool):
         default = "on" if default else "off"
+    default = "none" if default is None else default
     return "" if default == "" else f"`{default}`"
 
 

@@ -17,6 +17,7 @@ from sauna.experiments.report.curve import draw_curve
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
 from sauna.training import run as runs
+from sauna.training.coordinator import Callback
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.pick import pick
 from sauna.training.train import train_run
@@ -57,9 +58,12 @@ class Result:
         """`member name -> final numbers`, as in `summary.json`."""
         return run_directory.read_config_file(self.path / "summary.json")["members"]
 
-    def policy(self, member: int | str = 0) -> Any:
-        """The trained policy of a member, as `policy(observation) -> action`."""
-        return load(self.path, member, trust=True)
+    def policy(self, member: int | str = 0, *, best: bool = False) -> Any:
+        """The trained policy of a member, as `policy(observation) -> action`.
+
+        With `best`, it is the policy of the member's best evaluation during training.
+        """
+        return load(self.path, member, best=best, trust=True)
 
     def __repr__(self) -> str:
         return f"Result({str(self.path)!r})"
@@ -70,12 +74,22 @@ class _Silent(PlainDisplay):
         pass
 
 
-def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
+def train(
+    env: Any,
+    *,
+    quiet: bool = False,
+    callback: Callback | None = None,
+    trust: bool = False,
+    **settings: Any,
+) -> Result:
     """Trains PPO (or A2C), with SAUNA or without, on `env` and returns the finished run.
 
     Args:
       env: a Gymnasium id, `module:function`, or a function that makes an environment.
       quiet: show nothing.
+      callback: called with each row of `metrics.jsonl`, in their order; if it returns True, the
+        row's member stops there. It runs in this process. An exception of its ends the run.
+      trust: the run of `init_from` may name code of another user's; none of it runs.
       **settings: any field of `sauna.config.settings.Config` (`arm="sauna"`, `seeds=6`,
         `steps=1_000_000`), `seed=7` for the one seed 7, `batch_size` for samples per minibatch;
         functions, flax modules, filters and targets may be passed by value.
@@ -90,21 +104,28 @@ def train(env: Any, *, quiet: bool = False, **settings: Any) -> Result:
     picked = pick(given)
     overrides = translate(picked.overrides)
     display: Display = _Silent() if quiet else make_display()
-    run = runs.start(overrides, display, picked.found)
+    run = runs.start(overrides, display, picked.found, trust)
     if picked.said:
         display.say(picked.said)
-    train_and_draw(run, display, resume=False)
+    train_and_draw(run, display, resume=False, callback=callback)
     return Result(run.path)
 
 
-def train_and_draw(run: runs.Run, display: Display, *, resume: bool, inexact: bool = False) -> None:
+def train_and_draw(
+    run: runs.Run,
+    display: Display,
+    *,
+    resume: bool,
+    inexact: bool = False,
+    callback: Callback | None = None,
+) -> None:
     """Trains a run to its end, or to where a signal stops it, and draws its learning curve.
 
     Raises:
       BadInput, Interrupted, SaunaError: as `train_run`.
     """
     try:
-        if train_run(run, display, resume=resume, inexact=inexact):
+        if train_run(run, display, resume=resume, inexact=inexact, callback=callback):
             draw_curve(run.path)
     except Interrupted:
         draw_curve(run.path)
@@ -123,13 +144,14 @@ def compare(
     accept_changed_code: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Does filtering help on `env`? Trains the arms and says what the data support.
+    """Does a selection rule help on `env`? Trains the arms and says what the data support.
 
     The same as `sauna compare`: called again, it continues where it was stopped.
 
     Args:
       env: a Gymnasium id, `module:function`, or a function that another process can import.
-      arms: what to compare; the first is the baseline. `"all"`: a tournament of every rule.
+      arms: what to compare, also `"module:name"` of a rule of your own; the first is the baseline.
+        `"all"`: a tournament of every rule.
       rules: a tournament of ppo and these instead: more seeds only where something is open.
       controls: each arm that chooses samples gets its matched random control.
       out: the folder of runs and results.
@@ -168,9 +190,13 @@ def resume(
     inexact: bool = False,
     trust: bool = False,
     accept_changed_code: bool = False,
+    restart_schedule: bool = False,
+    callback: Callback | None = None,
     **changes: Any,
 ) -> Result:
-    """Continues an interrupted run to its end; the result is that of a run left alone.
+    """Continues a run to its end; the result is that of a run left alone.
+
+    With more `steps`, a run that has ended is trained further.
 
     Args:
       path: the run directory.
@@ -178,13 +204,17 @@ def resume(
       inexact: start new episodes where environments cannot be brought back.
       trust: the code that the run names may run, even if another user named it.
       accept_changed_code: go on even if the code that the run names is not what it was.
-      **changes: settings that do not touch what is computed (`processes`, ...), and the parts
+      restart_schedule: with more `steps`, schedules begin anew over those that are added.
+      callback: as in `train`; it is called with the rows from here on.
+      **changes: settings that do not touch what is computed (`processes`, ...), those that say how
+        far the run goes and how it is watched (`steps`, `eval_every`, ...), and the parts
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
     rest = provide(Path(path), changes, PARTS)
-    run = runs.reopen(Path(path), rest, display, trust, accept_changed_code)
-    train_and_draw(run, display, resume=True, inexact=inexact)
+    how = trust, accept_changed_code, restart_schedule
+    run = runs.reopen(Path(path), rest, display, *how)
+    train_and_draw(run, display, resume=True, inexact=inexact, callback=callback)
     return Result(run.path)
 
 
@@ -194,6 +224,7 @@ def load(
     member: int | str = 0,
     *,
     checkpoint: int | None = None,
+    best: bool = False,
     trust: bool = False,
     **parts: Any,
 ) -> Any:
@@ -205,15 +236,16 @@ def load(
       path: the run directory.
       member: name (`sauna/0`) or index.
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
+      best: as it was at its best evaluation during training (`eval_every`).
       trust: the code that the run names may run, even if another user named it.
       **parts: those that were passed by value when the run started (`env`, `network`, ...).
     """
-    from sauna.experiments.evaluate.artifact import load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
+    from sauna.training.artifact import load_artifact
 
     artifact = load_artifact(Path(path), iteration=checkpoint, trust=trust)
     provide(Path(path), parts, PARTS)
-    return TrainedPolicy(artifact, member)
+    return TrainedPolicy(artifact, member, best=best)
 
 
 def _named(name: str, value: Any) -> Any:

@@ -86,7 +86,10 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     resume.add_argument("run", metavar="RUN", help="run directory")
     text = "start new episodes where environments cannot be brought back"
     resume.add_argument("--inexact", action="store_true", help=text)
-    add_fields(resume, fields_with("resumable"), {**values, **dict.fromkeys(FIELDS, "")})
+    text = "with more --steps: schedules begin anew over those that are added"
+    resume.add_argument("--restart-schedule", action="store_true", help=text)
+    changeable = (*fields_with("extends_run"), *fields_with("resumable"))
+    add_fields(resume, changeable, {**values, **dict.fromkeys(FIELDS, "")})
 
     evaluate = commands.add_parser(
         "eval", help="play episodes with a trained run", allow_abbrev=False
@@ -98,6 +101,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     evaluate.add_argument("--env-kwargs", metavar="JSON", help=text)
     text = "the iteration of a kept checkpoint (default: the newest)"
     evaluate.add_argument("--checkpoint", metavar="N", help=text)
+    text = "each member as it was at its best evaluation during training"
+    evaluate.add_argument("--best", action="store_true", help=text)
     evaluate.add_argument("--video", action="store_true", help="record the first episode")
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
@@ -116,13 +121,14 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "leave the frames out: needs no renderer"
     inspect.add_argument("--no-frames", action="store_false", dest="frames", help=text)
 
-    text = "does filtering help on ENV? Trains several arms and says what the data support"
+    text = "does a selection rule help on ENV? Trains several arms and says what the data support"
     compare = commands.add_parser("compare", help=text, usage=usage % "compare", allow_abbrev=False)
     text = f"{FIELDS['env'].metadata['help']}; or runs that exist, as `plot` reads them"
     compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
-    text = f"what to compare; the first is the baseline (default {arms})"
+    text = f"what to compare, also module:name of a rule of your own (default {arms}); the first is"
+    text += " the baseline"
     compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
     text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
     compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
@@ -241,7 +247,8 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
     from sauna.training.pick import pick
 
-    stored = _overrides_in(values.pop("config"), values.pop("trust"))
+    trust = values.pop("trust")
+    stored = _overrides_in(values.pop("config"), trust)
     env = values.pop("env")
     picked = pick(_over(stored, values | ({"env": env} if env else {})))
     overrides = translate(picked.overrides)
@@ -249,11 +256,12 @@ def _train(values: dict[str, Any]) -> None:
     if runs.follows(overrides):
         runs.follow(overrides, display)
         return
-    run = runs.start(overrides, display, picked.found)
+    run = runs.start(overrides, display, picked.found, trust)
     if picked.said:
         display.say(picked.said)
     train_and_draw(run, display, resume=False)
-    print(f"learning curve: {run.path}/figures/learning_curve.png")
+    curve = run.path / "figures" / "learning_curve.png"
+    print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
 
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
@@ -281,7 +289,8 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
 
     path = Path(values.pop("run"))
-    inexact, *how = (values.pop(name) for name in ("inexact", "trust", "accept_changed_code"))
+    names = ("inexact", "trust", "accept_changed_code", "restart_schedule")
+    inexact, *how = (values.pop(name) for name in names)
     display = make_display()
     run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)
@@ -359,11 +368,12 @@ def _runs(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
+    from sauna.config.trust import named_code
     from sauna.experiments.study.command import check_study, load_spec, study_command
 
     name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
     spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
-    _run_study(spec, study_command(name, out), **values)
+    _run_study(spec, study_command(name, out, bool(named_code(spec.text))), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:

@@ -12,9 +12,18 @@ import pytest
 
 import sauna
 from helpers import SMALL, TESTS
-from sauna.config.code import changed_code, code_of
+from sauna.config.code import changed_code
+from sauna.config.code import code_of as all_code_of
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
+
+
+def code_of(settings: dict) -> dict[str, str]:
+    """Without the package's own sources, which every run names."""
+    found = all_code_of(settings)
+    del found["sauna"]
+    return found
+
 
 ENVIRONMENT = """
 from worlds import Scripted

@@ -59,7 +59,7 @@ def test_two_threads_train_on_their_own_parts(tmp_path: Path) -> None:
         result = sauna.api.Result(tmp_path / str(k))
         returns = {r for row in result.metrics for r in row["episode_returns"]}
         assert returns == {5.0 * k}
-        from sauna.experiments.evaluate.artifact import load_artifact
+        from sauna.training.artifact import load_artifact
 
         arrays = load_artifact(result.path).checkpoint.arrays
         assert arrays["ppo/0/params/policy_trunk/Dense_0/kernel"].shape[-1] == k

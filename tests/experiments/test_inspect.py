@@ -25,7 +25,6 @@ from sauna.algorithm.rollout.program import decide as decide_segment
 from sauna.algorithm.selection.registry import make_filter
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep
 from sauna.config.settings import Config
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import advantages, decide
 from sauna.experiments.inspect.inspection import (
@@ -39,6 +38,7 @@ from sauna.experiments.inspect.inspection import (
 from sauna.experiments.inspect.page import meaning
 from sauna.experiments.inspect.recording import MAX_FRAMES, SIDE, Frames, Recorder, _played
 from sauna.system.errors import BadInput
+from sauna.training.artifact import load_artifact
 from worlds import Drawn, Lives, Scripted
 
 THRESHOLD = 0.9

@@ -23,6 +23,8 @@ SETTINGS = {
     "threshold": 0.9,
     "checkpoint-every": 2,
     "processes": 1,
+    "eval-every": 640,
+    "eval-episodes": 2,
 }
 # Where a run's environments are stepped: the environment, and what else differs.
 BACKENDS: dict[str, tuple[str, dict[str, object]]] = {

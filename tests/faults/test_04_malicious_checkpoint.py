@@ -38,7 +38,7 @@ def experiment(least: int, seed: int, place: Path) -> Result:
 def _load(run: Path) -> None:
     """What `sauna eval` does before it makes a network."""
     from sauna.envs.make import env_maker
-    from sauna.experiments.evaluate.artifact import load_artifact
+    from sauna.training.artifact import load_artifact
 
     said: list[str] = []
     artifact = load_artifact(run, said.append)
@@ -53,7 +53,7 @@ def main() -> None:
 
     import sauna.envs.host.gymnasium_envs
     import sauna.envs.make
-    import sauna.experiments.evaluate.artifact
+    import sauna.training.artifact
 
     del gymnasium, safetensors, sauna
     place, number = Path(sys.argv[1]), int(sys.argv[2])

@@ -20,11 +20,11 @@ from faults.result import Result, Tally, assert_held
 from helpers import SMALL
 from sauna.config import presets
 from sauna.config.settings import FIELDS, TYPES, fields_with
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.episodes import evaluate
 from sauna.experiments.inspect.inspection import examine
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.training.artifact import load_artifact
 from threads import trained_here
 
 # A value of the same type that is another one, where adding 1 would not be.
@@ -36,6 +36,8 @@ OTHERS = {
     "gamma": 0.5,
     "gae_lambda": 0.5,
     "drop_rate": 0.25,
+    "stop_at": 2.0,
+    "init_from": "runs/another",
 }
 
 

@@ -29,7 +29,7 @@ from sauna.envs.make import env_maker
 from sauna.envs.workers import ProcessEnvs
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import SaunaError
-from sauna.training.loop.device import _check_sound, _setting
+from sauna.training.loop.device import _check_finite, _setting
 from sauna.training.loop.device_program import (
     MemberState,
     Parts,
@@ -208,7 +208,7 @@ class OnDevice:
         message = "it got through"
         for i in np.flatnonzero(reports.ran):
             try:
-                _check_sound(self._member, i, jax.tree.map(lambda x: x[i], reports))  # noqa: B023
+                _check_finite(self._member, i, jax.tree.map(lambda x: x[i], reports))  # noqa: B023
             except SaunaError as error:
                 message = str(error)
         if message != wanted:

@@ -115,6 +115,10 @@ def unread_setting(rng: random.Random) -> Mistake:
             ("max_env_steps_factor", "2"),
             ("drop_rate", "0.1"),
             ("env_timeout", "5"),
+            ("eval_episodes", "5"),
+            ("stop_at", "5"),
+            ("stop_when_flat", "5"),
+            ("init_normalizer", "fresh"),
         ]
     )
     return Mistake(["train", WORLD, "--arm", "ppo", flag(name), value], f"{name}: not read by arm")
@@ -128,6 +132,12 @@ def impossible_together(rng: random.Random) -> Mistake:
             Mistake(["train", WORLD, "--seeds", f"{(n := rng.randrange(99))},{n}"], "seeds:"),
             Mistake(["train", WORLD, f"--seeds={-rng.randrange(1, 99)},1"], "seeds:"),
             Mistake(["train", WORLD, "--arm", "random-drop"], "drop_rate:"),
+            Mistake(
+                ["train", WORLD, f"--schedule-start={rng.randrange(1, 9)}e9"], "schedule_start:"
+            ),
+            Mistake(
+                ["train", WORLD, "--init-from=nowhere"], "init_from: nowhere is no run", "", True
+            ),
             Mistake(["train", WORLD, "--gae-over", "kept"], "gae_over:"),
             Mistake(["train", WORLD, "--arm", "sauna,random-drop", "--drop-rate", "0.1"], "arm:"),
             Mistake(["train", WORLD, f"--env-processes={rng.randrange(2, 99)}"], "env_processes:"),

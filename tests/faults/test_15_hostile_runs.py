@@ -71,9 +71,9 @@ def _resume(run: Path) -> None:
 def _eval(run: Path) -> None:
     """What `sauna eval` does before it plays."""
     from sauna.envs.make import make_env
-    from sauna.experiments.evaluate.artifact import check_spaces, find_member, load_artifact
     from sauna.experiments.evaluate.policy import TrainedPolicy
     from sauna.system.errors import BadInput
+    from sauna.training.artifact import check_spaces, find_member, load_artifact
 
     artifact = load_artifact(run, lambda text: None)
     if not artifact.members:

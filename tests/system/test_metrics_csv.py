@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sauna.system.metrics_csv import NAME, MetricsCsv
+from sauna.system.metrics_csv import NAME, MetricsCsv, trained_seconds
 from sauna.system.safe_read import Untrusted
 
 START = {"member": "ppo/0", "arm": "ppo", "seed": 0}
@@ -72,6 +72,22 @@ def test_a_run_of_before_gets_a_table_without_times(tmp_path: Path) -> None:
     MetricsCsv(tmp_path)
     rows = (tmp_path / NAME).read_text().splitlines()
     assert len(rows) == 4 and rows[1] == "ppo/0,ppo,0,0,,32,"
+
+
+@pytest.mark.parametrize("row", ["[]", "{}", '{"iteration": []}', '{"seconds": "x"}', "nothing"])
+def test_strange_times_are_left_out(row: str, tmp_path: Path) -> None:
+    write_logs(tmp_path, 3)
+    (tmp_path / "timing.jsonl").write_text(f'{{"iteration": 0, "seconds": 2.5}}\n{row}\n')
+    MetricsCsv(tmp_path)
+    assert len((tmp_path / NAME).read_text().splitlines()) == 4
+    assert trained_seconds(tmp_path) == 2.5
+
+
+def test_the_time_goes_on_from_what_a_run_has(tmp_path: Path) -> None:
+    write_logs(tmp_path, 3)
+    assert trained_seconds(tmp_path) == 2.5
+    (tmp_path / "timing.jsonl").write_text('{"seconds": 1.5}\n' * 4)  # of 0.1.0
+    assert trained_seconds(tmp_path) == 6.0
 
 
 def test_it_is_not_written_through_a_link(tmp_path: Path) -> None:

@@ -20,12 +20,12 @@ def test_plain_ppo_shows_no_head_and_no_rule() -> None:
     shown = titles(arm="ppo")
     assert shown[:4] == ["env steps", "episodes", "return", "length"]
     assert {"entropy", "KL", "expl. var."} <= set(shown)
-    assert not {"keep rate", "sample rate", "Vex mean"} & set(shown)
+    assert not {"keep rate", "samples used", "Vex mean"} & set(shown)
 
 
 def test_a_rule_shows_what_it_takes() -> None:
     assert {"keep rate", "Vex mean", "Vex spread"} <= set(titles(arm="sauna"))
-    assert "sample rate" in titles(arm="gigaflow")
+    assert "samples used" in titles(arm="gigaflow")
 
 
 def row(member: str, env_steps: int) -> dict[str, object]:

@@ -6,6 +6,8 @@ import pytest
 
 import sauna
 from helpers import SMALL
+from sauna.config.checks import cautions
+from sauna.config.presets import resolve
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training.empty_updates import MAX_EMPTY, EmptyUpdates
 
@@ -47,3 +49,14 @@ def test_a_run_that_learns_nothing_fails(tmp_path, capsys) -> None:
 def test_a_minibatch_of_one_sample_is_refused() -> None:
     with pytest.raises(BadInput, match="minibatches: 32 of 32 samples leave 1 each"):
         sauna.train("worlds:Scripted", **{**SMALL, "minibatches": 32})
+
+
+def test_a_small_minibatch_is_named_and_trained_with() -> None:
+    def said(**settings: object) -> list[str]:
+        return cautions(resolve({"env": "x", **SMALL, **settings}))
+
+    assert said(minibatches=4) == [
+        "warning: minibatches of 8 samples: their advantages are standardised alone"
+    ]
+    assert said(minibatches=2) == [], "16 samples are enough"
+    assert said(minibatches=4, normalize_advantages=False) == [], "nothing is standardised"

@@ -1,7 +1,8 @@
 """The data that flows through one iteration, as declared types.
 
 Axes: `S` env steps tried in a rollout, `T` kept steps per env, `N` envs of one member, `B` samples
-of a minibatch. Everything here belongs to one member; `rollout/program.py` alone knows of several.
+of a minibatch. Everything here belongs to one member. An axis of members is added where they are
+collected (`rollout/`) and in the device's loop (`training/loop/device_program.py`).
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ class Keys(NamedTuple):
     order: Array  # of minibatches drawn on the accelerator; see `minibatch_order`
 
 
-SELECTION = 2**31 - 1  # no epoch has this number: epoch e's order has the key of number e
+SELECTION = 2**31 - 1  # no epoch has this number; the order of epoch e folds e into the key
 
 
 def selection_key(keys: Keys, iteration: Any) -> Array:
@@ -184,7 +185,7 @@ class Choice(NamedTuple):
     weight: Any = None  # [M] multiplies the policy term; None: 1
     value_probability: Any = None  # [M] if the value loss draws rows of its own
     value_weight: Any = None  # [M] multiplies the terms of the value and Vex losses; None: 1
-    score: Any = None  # [M] how much the rule wants a row: what `reversed` turns round
+    score: Any = None  # [M] how much the rule wants a row: what `reversed` ranks by
 
 
 class Draw(NamedTuple):

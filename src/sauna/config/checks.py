@@ -81,6 +81,12 @@ def check_consistent(config: Config) -> None:
         )
     if config.steps < batch:
         raise BadInput(f"steps: {config.steps} is less than one rollout of {batch} steps")
+    if config.schedule_start >= config.steps:
+        raise BadInput(f"schedule_start: {config.schedule_start} is not below steps {config.steps}")
+    if config.distributed and config.init_from:
+        raise BadInput("init_from: not read with distributed")
+    if config.distributed and config.eval_every:
+        raise BadInput("eval_every: not read with distributed; use `sauna eval`")
     if config.gae_over == "kept" and config.truncation == "bootstrap":
         raise BadInput(
             "gae_over: kept needs truncation=terminate (the final value belongs to a step that "

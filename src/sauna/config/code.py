@@ -1,7 +1,8 @@
 """Digests of the code that a run names, so that results of other code are not taken for its own.
 
 A name `module:name` stands for its module's source and for the sources that this imports, as far
-as they are the user's own. Of an installed package it stands for the version, too.
+as they are the user's own. Of an installed package it stands for the version, too. The sources of
+this package that train count as well: see `own_sources.py`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from sauna.config.own_sources import KEY, edited_sources, own_sources
 from sauna.config.trust import named_code
 from sauna.system.tracebacks import is_users
 
@@ -32,9 +34,10 @@ PACKAGES = {
 def code_of(settings: Mapping[str, Any]) -> dict[str, str]:
     """`{module: SHA-256, package: version}` of the code that settings, or a stored config, name.
 
-    Its modules have been imported already; nothing is imported here.
+    Its modules have been imported already; nothing is imported here. `sauna` holds the sources of
+    this package.
     """
-    found: dict[str, str] = {}
+    found = {KEY: own_sources()}
     env = str(settings.get("config", settings).get("env"))
     for module in _named_modules(settings, env):
         _add_module(module, found)
@@ -45,9 +48,13 @@ def code_of(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def changed_code(before: Mapping[str, Any], now: Mapping[str, str]) -> str:
-    """What of the code is not what it was, as a text; empty where nothing differs."""
+    """What of the code is not what it was, as a text; empty where nothing differs.
+
+    A newer version of this package is no change: `own_sources.newer_sources` names it.
+    """
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    parts = []
+    names = [name for name in names if name != KEY]
+    parts = [text for text in [edited_sources(before, now)] if text]
     for name in sorted(names):
         old, new = before.get(name), now.get(name)
         if " " in name:  # a package

@@ -6,7 +6,7 @@ the two differ in the choice alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -37,14 +37,22 @@ def rule_of(arm: str) -> str | None:
     return rule if rule and control in CONTROLS else None
 
 
-def with_controls(arms: Sequence[str], given: Mapping[str, Any]) -> tuple[str, ...]:
+def with_controls(
+    arms: Sequence[str],
+    given: Mapping[str, Any],
+    control_of: Callable[[str, Mapping[str, Any]], str | None] = control_of,
+) -> tuple[str, ...]:
     """Puts behind each arm that chooses samples its matched random control.
 
     An arm with a control among `arms` gets no other; `random-drop` is one of every filter.
+
+    Args:
+      control_of: names the control of an arm.
     """
     named = {rule_of(arm) for arm in arms}
     if "random-drop" in arms:
-        named |= {arm for arm in arms if arm_settings(arm)["filter"] != "none"}
+        built_in = (arm for arm in arms if ":" not in arm)
+        named |= {arm for arm in built_in if arm_settings(arm)["filter"] != "none"}
     found = []
     for arm in arms:
         control = control_of(arm, given) if arm not in named else None

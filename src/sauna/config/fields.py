@@ -15,6 +15,7 @@ GROUPS = (
     "task",
     "run",
     "where it runs",
+    "evaluation",
     "learning",
     "network",
     "normalisation",
@@ -39,6 +40,7 @@ def option(
     needs_spaces: tuple[str, Callable[[Any], bool]] | None = None,
     device_only: bool = False,
     resumable: bool = False,
+    extends_run: bool = False,
     machine_local: bool = False,
     decided_by_study: bool = False,
     rule_of_experiment: bool = False,
@@ -61,6 +63,8 @@ def option(
       device_only: it is read only by environments on the device.
       resumable: `resume` may change it: it does not touch what is computed, or only its rounding
         when another number of devices computes it.
+      extends_run: `resume` may change it, and the run goes on with the new value from there on: it
+        says how far a run goes, or how it is watched, and not how it learns.
       machine_local: machines that train together may differ in it.
       decided_by_study: a study or a comparison sets it itself.
       rule_of_experiment: a rule of the experiment rather than of the filter. An unfiltered arm that

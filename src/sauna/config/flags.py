@@ -51,6 +51,7 @@ def _title(name: str) -> str:
 def _add_field(group: Any, name: str, value: Any) -> None:
     text = FIELDS[name].metadata["help"]
     shown = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    shown = "none" if value is None else shown
     if name == "seeds" and value == (0,):
         shown = "1: seed 0"
     if name == "preset":
@@ -83,7 +84,7 @@ def metavar(name: str) -> str:
     if typing.get_origin(field_type) is tuple:
         item = typing.get_args(field_type)[0]
         return "NAME,..." if item is str else "INT,..."
-    return {int: "INT", float: "FLOAT"}.get(field_type, "TEXT")
+    return {int: "INT", float: "FLOAT", float | None: "FLOAT"}.get(field_type, "TEXT")
 
 
 def shown_values(arguments: Sequence[str], arm: str | None = None) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from functools import partial
 
 from sauna.config import readers
 from sauna.config.fields import option
+from sauna.config.run_options import RunOptions
 
 FILTERS = ("none", "sauna", "random-drop")
 SAMPLERS = (
@@ -28,9 +29,6 @@ SAMPLERS = (
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
 NETWORKS = ("auto", "mlp", "nature-cnn")
 
-_task = partial(option, group="task")
-_run = partial(option, group="run", shapes_program=False)
-_where = partial(option, group="where it runs", shapes_program=False)
 _learning = partial(option, group="learning")
 _network = partial(option, group="network")
 _normalisation = partial(option, group="normalisation")
@@ -40,123 +38,8 @@ _update = partial(option, group="update rules")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RunOptions):
     """All settings of one run; see each field's help line. Built by `resolve`, never by hand."""
-
-    env: str = _task(
-        "",
-        "Gymnasium id, or module:function that makes an environment",
-        common=True,
-        plugin=True,
-        decided_by_study=True,
-    )
-    env_kwargs: str = _task("{}", "keyword arguments of the environment, as a JSON object")
-    arm: tuple[str, ...] = _run(
-        ("ppo",), "what to train, a name or several: see `sauna list arms`", common=True
-    )
-    algorithm: str = _run(
-        "ppo",
-        "how the policy is improved: by PPO, or by A2C",
-        choices=("ppo", "a2c"),
-        shapes_program=True,
-    )
-    preset: str = _run(
-        "mujoco",
-        "settings to start from, see `sauna list presets`; auto: those of the environment, as "
-        "`train` takes if none is named (with A2C: a2c)",
-        common=True,
-    )
-    seeds: tuple[int, ...] = _run(
-        (0,),
-        "how many seeds (6: seeds 0 to 5; 42: 42 of them), or which ones (100,101,110)",
-        common=True,
-    )
-    steps: int = _run(
-        1_000_000, "env steps per member", at_least=1, common=True, shapes_program=True
-    )
-
-    out: str = _run(
-        "",
-        "run directory; none: runs/ENV_ARM_SEEDS_TIME",
-        common=True,
-        machine_local=True,
-        decided_by_study=True,
-    )
-    processes: int = _where(
-        0,
-        "processes that share the members (0: one per core)",
-        at_least=0,
-        common=True,
-        resumable=True,
-        machine_local=True,
-        decided_by_study=True,
-    )
-    env_processes: int = _where(
-        0,
-        "worker processes that step the environments of one process (0: stepped in-process)",
-        at_least=0,
-        read_when=readers.ON_HOST,
-        resumable=True,
-    )
-    backend: str = _where(
-        "auto",
-        "what steps the environments (auto: the fastest with the same "
-        "numbers; device: inside the compiled program)",
-        choices=("auto", "gymnasium", "device"),
-        resumable=True,
-    )
-    reset: str = _where(
-        "fresh",
-        "on the device, an episode starts in a new state, or in its environment's first one again",
-        choices=("fresh", "cached"),
-        shapes_program=True,
-        device_only=True,
-    )
-    device: str = _where(
-        "auto",
-        "with backend device: gpu if there is one (auto), or the CPU",
-        choices=("auto", "cpu", "gpu"),
-        common=True,
-        device_only=True,
-        resumable=True,
-    )
-    devices: int = _where(
-        0,
-        "devices that share the population (0: every GPU, or one CPU; 8 simulates 8 on a CPU)",
-        at_least=0,
-        device_only=True,
-        resumable=True,
-    )
-    distributed: str = _where(
-        "",
-        "HOST:PORT,COUNT,INDEX: COUNT machines train together; INDEX 0 writes the run",
-        device_only=True,
-        resumable=True,
-        machine_local=True,
-        decided_by_study=True,
-    )
-    env_timeout: float = _where(
-        60.0,
-        "seconds to wait for an environment worker",
-        above=0,
-        read_when=readers.WORKERS,
-        resumable=True,
-    )
-    checkpoint_every: int = _run(50, "iterations between checkpoints", at_least=1, resumable=True)
-    keep_checkpoints: int = _run(
-        2,
-        "how many of the newest checkpoints to keep",
-        at_least=1,
-        resumable=True,
-        machine_local=True,
-    )
-    tensorboard: bool = _run(
-        False,
-        "also write the metrics for TensorBoard",
-        resumable=True,
-        machine_local=True,
-        decided_by_study=True,
-    )
 
     envs: int = _learning(1, "environments per member (N)", at_least=1, common=True)
     rollout_steps: int = _learning(
@@ -169,6 +52,12 @@ class Config:
     )
     learning_rate_schedule: str = _learning(
         "linear", "over the budget of steps: to 0, or constant", choices=("linear", "constant")
+    )
+    schedule_start: int = _learning(
+        0,
+        "steps of the budget before which schedules keep their first value",
+        at_least=0,
+        read_when=readers.SCHEDULED,
     )
     optimizer: str = _learning("adam", "what scales the gradient", choices=("adam", "rmsprop"))
     adam_epsilon: float = _learning(1e-5, "Adam's epsilon", above=0, read_when=readers.ADAM)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sauna.config.settings import FIELDS, flag
+from sauna.config.settings import FIELDS, fields_with, flag
 from sauna.system.errors import nearest
 
 SAME = {
@@ -80,6 +80,12 @@ SAME = {
     "experiment_name": "out",
     "run_name": "out",
     "log_dir": "out",
+    "eval_freq": "eval_every",
+    "evaluation_frequency": "eval_every",
+    "n_eval_episodes": "eval_episodes",
+    "num_eval_episodes": "eval_episodes",
+    "reward_threshold": "stop_at",
+    "max_no_improvement_evals": "stop_when_flat",
     "cuda": "device",
     "n_seeds": "seeds",
 }
@@ -112,7 +118,9 @@ def flag_hint(argument: str, known: list[str], command: str | None) -> str:
     """
     typed = argument.split("=")[0]
     name = typed.lstrip("-").removeprefix("no-").replace("-", "_")
-    if command == "resume" and SAME.get(name, name) in (*FIELDS, *ACCEPTED):
+    ours = SAME.get(name, name)
+    changeable = (*fields_with("extends_run"), *fields_with("resumable"))
+    if command == "resume" and ours in (*FIELDS, *ACCEPTED) and ours not in changeable:
         return (
             "; a resumed run computes what it began with: "
             "`sauna train --config RUN/config.json` trains anew with other settings"

@@ -25,6 +25,8 @@ def read_value(name: str, value: Any, field_type: Any) -> Any:
         return value if isinstance(value, bool) else _BOOLEANS[str(value).lower()]
     if field_type is int:
         return _integer(value)
+    if field_type == float | None:
+        return None if value in (None, "none") else read_value(name, value, float)
     if field_type is float:
         if isinstance(value, bool):
             raise TypeError

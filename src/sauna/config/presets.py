@@ -1,6 +1,6 @@
 """Named settings: presets, arms (which selection method), and how a run's config is resolved.
 
-A preset says how an algorithm trains; an arm says which transitions the update keeps. METHOD, in
+A preset says how an algorithm trains; an arm says which rules a run trains with. METHOD, in
 `docs/concepts/ppo.md`, gives the origin of every number.
 """
 
@@ -325,7 +325,7 @@ def _check_arms(arms: tuple[str, ...], parsed: Mapping[str, Any]) -> None:
 def chosen_preset(parsed: Mapping[str, Any]) -> str:
     """Names the preset that is given, or the first one of the algorithm.
 
-    `auto` is the one of the environment, or of an algorithm that has none for tasks.
+    `auto` is the environment's, with A2C the first one.
 
     Raises:
       BadInput: there is no such preset, it is another algorithm's than the one named, or `auto`

@@ -40,4 +40,10 @@ MASKED = (
 STANDARDISED = ("normalize_advantages", lambda c: c.normalize_advantages)
 WEIGHTED = ("a loss_weight", lambda c: c.loss_weight != "none")
 STOPPED = ("a stop rule", lambda c: c.stop != "none")
+SCHEDULED = (
+    "a schedule that is not constant",
+    lambda c: any(getattr(c, name) != "constant" for name in vars(c) if name.endswith("_schedule")),
+)
+EVALUATED = ("eval_every above 0", lambda c: c.eval_every > 0)
+FINE_TUNED = ("init_from", lambda c: bool(c.init_from))
 AUXILIARY = ("an auxiliary head", lambda c: c.auxiliary != "none")

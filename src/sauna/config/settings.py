@@ -17,6 +17,8 @@ from sauna.system.errors import BadInput, nearest
 
 NATIVE = ("gymnax", "playground", "brax", "mjx")  # `NAME/...`: environments of the device alone
 
+EXAMPLE = """'{"share": 0.25}'"""  # of a field `..._kwargs`, as a shell takes it
+
 FIELDS = {field.name: field for field in dataclasses.fields(Config)}
 TYPES = typing.get_type_hints(Config)
 
@@ -51,7 +53,8 @@ def parse(name: str, value: Any) -> Any:
     try:
         parsed = read_value(name, value, field_type)
     except (ValueError, TypeError, KeyError, OverflowError):
-        expected = "a JSON object" if name.endswith("_kwargs") else _KINDS[field_type]
+        example = f"a JSON object, such as {EXAMPLE}"
+        expected = example if name.endswith("_kwargs") else _KINDS[field_type]
         raise BadInput(f"{name}: cannot read {value!r} as {expected}") from None
     named = meta["plugin"] and ":" in str(parsed)
     if isinstance(parsed, str) and meta["choices"] and parsed not in meta["choices"] and not named:
@@ -64,7 +67,7 @@ def parse(name: str, value: Any) -> Any:
 
 
 def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:
-    if isinstance(value, str | bool):
+    if value is None or isinstance(value, str | bool):
         return
     if isinstance(value, int) and abs(value) >= 2**63:
         raise BadInput(f"{name}: must be a number of at most 63 bits")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 MAX_NAME = 100  # letters of a key
+SUCCESS_RATE, INFO_PREFIX = "success_rate", "info_"  # of the metrics' keys
 
 
 def numbers_of(info: Any) -> dict[str, float]:
@@ -20,6 +22,20 @@ def numbers_of(info: Any) -> dict[str, float]:
         if is_metric_name(name) and (number := _number_in(value)) is not None:
             found[name] = number
     return found
+
+
+def info_means(infos: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of each number over the episodes that gave it, in the order of their names."""
+    found: dict[str, list[float]] = {}
+    for info in infos:
+        for name, number in info.items():
+            found.setdefault(name, []).append(number)
+    return {name: sum(found[name]) / len(found[name]) for name in sorted(found)}
+
+
+def info_key(name: str) -> str:
+    """The metric of a number that environments give in `info`."""
+    return SUCCESS_RATE if name == "is_success" else INFO_PREFIX + name
 
 
 def is_metric_name(name: Any) -> bool:

@@ -55,7 +55,7 @@ class Standing(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """How far a tournament has come on the scores that are there.
+    """How far a tournament has come on the scores so far.
 
     Attributes:
       standings: of each arm that was looked at, its last one.
@@ -178,7 +178,7 @@ def replay(
 def tournament(
     draw: Mapping[str, np.ndarray], baseline: str, design: Sequence[Look] = DESIGN
 ) -> dict[str, Standing]:
-    """Plays the whole design on scores that are there already, `[seeds]` of each arm.
+    """Plays the whole design on scores that are known already, `[seeds]` of each arm.
 
     An arm's scores beyond its last look are not read.
     """

@@ -196,7 +196,7 @@ def improvement_over_tasks(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Es
 def exact_p(x: np.ndarray, y: np.ndarray) -> float:
     """Computes the two-sided p value of the Mann-Whitney test, exact with ties as without.
 
-    The chance, over all ways to deal the pooled ranks out to the two arms, of a rank sum at least
+    The chance, over all ways to split the pooled ranks between the two arms, of a rank sum at least
     as far from its mean as the one seen. It supposes equal distributions, not merely
     P(X > Y) = 1/2. Above `EXACT_UP_TO` runs, scipy's normal approximation.
     """

@@ -7,15 +7,16 @@ appears for the first time and where a run is resumed; in between, rows are adde
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import itertools
-import json
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from sauna.system.logs import lines
+from sauna.system.logs import lines, read_row
 from sauna.system.safe_write import open_grown, replacing, sync_folder
 
 NAME = "metrics.csv"
@@ -49,8 +50,8 @@ class MetricsCsv:
             file.write(self._text(cells))
 
     def sync(self) -> None:
-        """Flushes it to the disk."""
-        if (self._run / NAME).exists():
+        """Flushes it to the disk; one that fails now costs this table alone."""
+        with contextlib.suppress(OSError):
             sync_folder(self._run / NAME)
 
     def _write_anew(self) -> None:
@@ -76,9 +77,26 @@ def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _rows(run: Path) -> Iterator[dict[str, Any]]:
     """The rows of a run, each with its iteration's `wall_seconds`; both logs rise by iteration."""
-    timings = map(json.loads, lines(run / "timing.jsonl"))
-    timing: dict[str, Any] = next(timings, {})
-    for row in map(json.loads, lines(run / "metrics.jsonl")):
-        while timing and timing["iteration"] < row["iteration"]:
-            timing = next(timings, {})
-        yield {**row, WALL: timing.get(WALL)}
+    times = {str(row.get("iteration")): row.get(WALL) for row in _read(run, "timing.jsonl")}
+    for row in _read(run, "metrics.jsonl"):
+        yield {**row, WALL: times.get(str(row["iteration"]))}
+
+
+def _read(run: Path, name: str) -> Iterator[dict[str, Any]]:
+    """The rows of a log, up to the first that is none."""
+    for line in lines(run / name):
+        try:
+            row = read_row(line, name)
+        except (ValueError, RecursionError):
+            return
+        yield row
+
+
+def trained_seconds(run: Path) -> float:
+    """Counts the seconds that a run has been trained for; of 0.1.0 those of its iterations."""
+    total = 0.0
+    for row in _read(run, "timing.jsonl"):
+        seconds, wall = row.get("seconds", 0.0), row.get(WALL)
+        total += seconds if isinstance(seconds, int | float) else 0.0
+        total = float(wall) if isinstance(wall, int | float) else total
+    return total if math.isfinite(total) else 0.0

@@ -7,6 +7,7 @@ timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, 
 metrics.csv     both as one table; see metrics_csv.py
 summary.json    how each member ended
 checkpoints/    see checkpoint.py
+init/           a checkpoint of what the run started from, with init_from
 figures/, videos/, tensorboard/
 """
 
@@ -21,6 +22,7 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import subprocess
 import time
 from collections.abc import Mapping
@@ -41,7 +43,9 @@ _PARTS: dict[str, type] = {
     "drop_rates": list,
     "code": dict,
     "code_before": list,
+    "extended": list,
 }
+INITIAL = "init"  # the folder of what a run starts from
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -111,6 +115,7 @@ def discard(path: Path, made: bool) -> None:
     with contextlib.suppress(OSError):  # the first error is reported already, and matters more
         (path / "config.json").unlink(missing_ok=True)
         (path / ".lock").unlink(missing_ok=True)
+        shutil.rmtree(path / INITIAL, ignore_errors=True)
         if made:
             path.rmdir()
 
@@ -225,6 +230,13 @@ def is_complete(run: Path) -> bool:
     """Whether the run was trained to its end."""
     path = run / "summary.json"
     return os.path.lexists(path) and bool(_read(path).get("complete"))
+
+
+def reopen_summary(run: Path) -> None:
+    """Notes that a run is not complete any more, as it is to go further."""
+    path = run / "summary.json"
+    if os.path.lexists(path):
+        write_json(path, {**_read(path), "complete": False})
 
 
 def versions() -> dict[str, str]:

@@ -8,9 +8,10 @@ are shared over processes.
 
 from __future__ import annotations
 
+import copy
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -23,7 +24,7 @@ from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.system.logs import Logs, check_logs
-from sauna.system.metrics_csv import MetricsCsv
+from sauna.system.metrics_csv import MetricsCsv, trained_seconds
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
 from sauna.system.safe_write import replace_file
 from sauna.system.signals import handled
@@ -33,8 +34,12 @@ from sauna.training.display import Display
 from sauna.training.empty_updates import EmptyUpdates
 from sauna.training.info_names import InfoNames
 from sauna.training.run import Run, resume_command
+from sauna.training.summary import METRIC, STOPS, summarize
 from sauna.training.tensorboard import TensorBoard
 from sauna.training.worker import serve, write_job
+
+# Sees a row of `metrics.jsonl`; its member stops if it returns True.
+Callback = Callable[[dict[str, Any]], bool | None]
 
 LEAD = 2  # iterations that a process may be ahead of the slowest one
 SECONDS_AHEAD = 2.0  # on the device, where a call runs several: what a signal may have to wait
@@ -49,9 +54,12 @@ class Coordinator:
         run: Run,
         display: Display,
         loaded: checkpoint.Checkpoint | None,
+        initial: Mapping[str, np.ndarray],
         inexact: bool,
+        callback: Callback | None = None,
     ) -> None:
-        self._run, self._display = run, display
+        self._run, self._display, self._callback = run, display, callback
+        self._stopped: dict[str, int] = {}  # by the callback: member, the iteration after its last
         self._iteration = loaded.manifest["iteration"] if loaded else 0
         self._parts = np.array_split(np.arange(len(run.members)), run.config.processes)
         self._rows: dict[int, dict[int, Message]] = {}
@@ -66,16 +74,16 @@ class Coordinator:
         self._stopping = False
         self._tensorboard = TensorBoard(run.path, run.config)
         self._empty_updates = EmptyUpdates()
-        self._before = run_directory.rows(run.path)  # of the run that is resumed
-        self._info_names = InfoNames(self._before)
+        self._info_names = InfoNames(run_directory.rows(run.path))
         replay = not inexact and run.differs is None
         if loaded and not replay:
             display.say("warning: not an exact resume: every environment starts a new episode")
-        self._workers = [self._start(part, loaded, replay) for part in self._parts]
+        given = loaded.arrays if loaded else initial
+        self._workers = [self._start(p, given, loaded is not None, replay) for p in self._parts]
         self._watchdog = Watchdog(self._workers)
 
     def _start(
-        self, part: np.ndarray, loaded: checkpoint.Checkpoint | None, replay: bool
+        self, part: np.ndarray, given: Mapping[str, np.ndarray], is_restored: bool, replay: bool
     ) -> Worker:
         run = self._run
         if local_parts(run.config):
@@ -85,7 +93,7 @@ class Coordinator:
         names = [run.members[index].name for index in part]
         arrays = {
             key: value
-            for key, value in (loaded.arrays if loaded else {}).items()
+            for key, value in given.items()
             if any(key.startswith(name + "/") for name in names)
         }
         header = write_job(
@@ -94,6 +102,7 @@ class Coordinator:
             [int(index) for index in part],
             self._iteration,
             replay,
+            is_restored,
         )
         try:
             worker.send(header, arrays)
@@ -119,14 +128,14 @@ class Coordinator:
           SaunaError: something failed; the last good checkpoint is on disk.
         """
         run = self._run
-        self._display.open(run.config, run.members, run.path, self._before)
+        self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
             self._grant()
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None
-            self._save(self._last_iteration(), self._logs.counted())
-            self._write_summary(complete)
+            arrays = self._save(self._last_iteration(), self._logs.counted())
+            self._write_summary(complete, arrays)
         if not complete:
             raise Interrupted(
                 self._signal or 0,
@@ -155,15 +164,21 @@ class Coordinator:
     def _grant(self) -> None:
         """Lets every worker run at most `self._lead` iterations ahead of the slowest."""
         running = [r for r, end in zip(self._reached, self._ended, strict=True) if end is None]
-        if running and not self._stopping and min(running) + self._lead > self._granted:
-            self._granted = min(running) + self._lead
+        if not running or self._stopping:
+            return
+        # With a callback, an iteration begins when it has seen all rows before.
+        granted = self._iteration + 1 if self._callback else min(running) + self._lead
+        if granted > self._granted:
+            self._granted = granted
             self._send_grant()
 
     def _send_grant(self) -> None:
         for worker, end in zip(self._workers, self._ended, strict=True):
             if end is None:
                 try:
-                    worker.send({"granted": self._granted, "stop": self._stopping})
+                    stopped = sorted(self._stopped)
+                    message = {"granted": self._granted, "stop": self._stopping}
+                    worker.send(message | ({"stopped": stopped} if stopped else {}))
                 except BrokenPipeError:
                     pass  # its end is noticed, and named, when its inbox is read
 
@@ -213,6 +228,8 @@ class Coordinator:
                 self._display.rows(header["rows"])
                 self._grant()
                 self._flush()
+                if self._callback:
+                    self._grant()
             case "state":
                 self._states[number][header["iteration"]] = message.arrays
                 self._flush()
@@ -248,13 +265,16 @@ class Coordinator:
             for states, end in zip(self._states, self._ended, strict=True)
         )
 
-    def _save(self, iteration: int, logs: dict[str, Any]) -> None:
+    def _save(self, iteration: int, logs: dict[str, Any]) -> dict[str, np.ndarray]:
         """Saves all members at (the start of) an iteration, or at their end before it."""
         arrays: dict[str, np.ndarray] = {}
         for states in self._states:
             arrays |= states[iteration if iteration in states else max(states)]
             for old in [key for key in states if key < iteration and key != max(states)]:
                 del states[old]
+        for name, end in self._stopped.items():
+            if end <= iteration:
+                arrays[f"{name}/counters/stopped"] = np.asarray(STOPS.index("callback"))
         checkpoint.save_checkpoint(
             self._run.path / "checkpoints",
             iteration,
@@ -262,6 +282,7 @@ class Coordinator:
             {**self._run.manifest(), **logs},
             self._run.config.keep_checkpoints,
         )
+        return arrays
 
     def _write_rows(self, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> None:
         seconds = max(timing["seconds"] for timing in timings)
@@ -281,6 +302,8 @@ class Coordinator:
                 for t in timings
                 for member, seconds in t["update_cpu_seconds"].items()
             }
+        if any("evaluation_seconds" in timing for timing in timings):
+            timing["evaluation_seconds"] = max(t.get("evaluation_seconds", 0.0) for t in timings)
         warnings = [*self._empty_updates.see(rows), *map(self._info_names.admit, rows)]
         for warning in filter(None, warnings):
             self._display.say(warning)
@@ -288,40 +311,32 @@ class Coordinator:
         self._logs.append("timing.jsonl", [timing])
         self._csv.append(rows, timing["wall_seconds"])
         self._tensorboard.write(rows, timing)
+        if self._callback is not None:
+            self._call(self._callback, rows)
 
-    def _write_summary(self, complete: bool) -> None:
-        self._csv.sync()
+    def _call(self, callback: Callback, rows: list[dict[str, Any]]) -> None:
+        """Shows each row to the user's callback, which may stop its member."""
+        for row in rows:
+            try:
+                stops = callback(copy.deepcopy(row))
+            except Exception as error:
+                error.add_note(
+                    f"raised by the callback, at iteration {row['iteration']} of {row['member']}; "
+                    f"continue from the last checkpoint with: {resume_command(self._run.path)}"
+                )
+                raise
+            if stops:
+                self._stopped.setdefault(row["member"], self._iteration + 1)
+
+    def _write_summary(self, complete: bool, arrays: Mapping[str, np.ndarray]) -> None:
         check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
-        last: dict[str, dict[str, Any]] = {}
-        for row in run_directory.rows(self._run.path):
-            last[row["member"]] = row
-        kept = (
-            "arm",
-            "seed",
-            "env_steps",
-            "kept_steps",
-            "episodes",
-            "return_mean",
-            "return_mean_reported",
-            "explained_variance",
-        )
-        summary = {
-            name: {key: row[key] for key in kept if key in row} for name, row in last.items()
-        }
-        text = "return_mean: mean training return (sampled actions) of the last 100 episodes"
+        members = summarize(run_directory.rows(self._run.path), arrays)
         run_directory.write_json(
             self._run.path / "summary.json",
-            {"complete": complete, "metric": text, "members": summary},
+            {"complete": complete, "metric": METRIC, "members": members},
         )
-        self._display.summary(summary)
-
-
-def trained_seconds(run: Path) -> float:
-    """Counts the seconds that a run has been trained for; of 0.1.0 those of its iterations."""
-    rows = run_directory.rows(run, "timing.jsonl")
-    if rows and "wall_seconds" in rows[-1]:
-        return float(rows[-1]["wall_seconds"])
-    return float(sum(row["seconds"] for row in rows))
+        self._csv.sync()
+        self._display.summary(members)
 
 
 def lead_for(seconds: float) -> int:

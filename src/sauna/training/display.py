@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.training.summary import with_evaluation
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
 NAMED = 6  # members that a progress line names; of more it gives the mean of each arm
@@ -62,7 +63,7 @@ class _Progress:
 
     def _take(self, rows: list[dict[str, Any]]) -> None:
         for row in rows:
-            self.latest[row["member"]] = row
+            self.latest[row["member"]] = with_evaluation(row, self.latest[row["member"]])
             self.succeeds |= "success_rate" in row
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
@@ -162,7 +163,7 @@ class PlainDisplay:
             self.say(
                 f"{name}: return {number(row, 'return_mean', '.2f')} "
                 f"(training, last 100 episodes), {row['env_steps']:,} env steps, "
-                f"{row['kept_steps']:,} kept"
+                f"{row['kept_steps']:,} kept{evaluated(row)}"
             )
 
     def close(self) -> None:
@@ -239,11 +240,27 @@ class LiveDisplay:
         self.refresh()
         self.close()
         self.say("return: mean training return of the last 100 episodes")
+        for name, row in members.items():
+            if text := evaluated(row):
+                self.say(f"{name}{text}")
 
     def close(self) -> None:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+def evaluated(row: dict[str, Any]) -> str:
+    """Says what a member's evaluations came to, and whether it was stopped early."""
+    text = ""
+    if "eval_return_mean" in row:
+        text = (
+            f"; evaluation: return {row['eval_return_mean']:.2f}, best "
+            f"{row['eval_return_best']:.2f}, {row['eval_env_steps']:,} env steps of its own"
+        )
+    if "stopped_early" in row:
+        text += f"; stopped early ({row['stopped_early']})"
+    return text
 
 
 def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str, str, str]]:
@@ -264,10 +281,12 @@ def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str,
     if succeeds:
         columns.insert(3, ("success", "success_rate", ".0%"))
     configs = [member.config for member in members]
+    if any(config.eval_every for config in configs):
+        columns.insert(3, ("evaluation", "eval_return_mean", ".1f"))
     if any(config.filter != "none" for config in configs):
         columns.append(("keep rate", "keep_rate", ".3f"))
     if any(config.sampler != "none" for config in configs):
-        columns.append(("sample rate", "sample_rate", ".3f"))
+        columns.append(("samples used", "sample_rate", ".3f"))
     if any(config.vex_coef > 0 for config in configs):
         columns += [("Vex mean", "vex_mean", ".3f"), ("Vex spread", "vex_spread", ".3f")]
     return columns

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from sauna.training.loop.metrics import INFO_PREFIX
+from sauna.envs.info import INFO_PREFIX
 
 MAX_NAMES = 32
 

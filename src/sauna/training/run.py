@@ -15,6 +15,7 @@ from typing import IO, Any
 from sauna.config.checks import cautions, check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
 from sauna.config.imported_from import KEY, folders_of, names_the_folder
+from sauna.config.own_sources import newer_sources
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
@@ -27,6 +28,15 @@ from sauna.system.errors import BadInput, SaunaError
 from sauna.system.jax_setup import configure_jax
 from sauna.system.working_folder import kept_folder
 from sauna.training.display import Display
+from sauna.training.extension import (
+    check_extension,
+    check_restart,
+    describe_extension,
+    extended,
+    extension,
+    goes_further,
+)
+from sauna.training.initial import read_initial, save_initial
 from sauna.training.loop.multihost import Follower, join, read_host_rank
 from sauna.training.prepare import (
     Prepared,
@@ -50,6 +60,7 @@ class Run:
     def __init__(self, path: Path, prepared: Prepared, made: bool = False) -> None:
         self.path, self.prepared, self.made = path, prepared, made
         self.code = code_of(to_stored(prepared.run))
+        self.extended: list[dict[str, Any]] = []  # what an earlier end of the run was
         self.lock: IO[str] = run_directory.lock(path)
 
     @property
@@ -83,13 +94,19 @@ class Run:
         }
 
 
-def start(overrides: Mapping[str, Any], display: Display, found: Probe | None = None) -> Run:
+def start(
+    overrides: Mapping[str, Any],
+    display: Display,
+    found: Probe | None = None,
+    trust: bool = False,
+) -> Run:
     """Starts a new run: everything is checked before anything is created.
 
     Args:
       overrides: the settings that a user gives.
       display: what is said goes there.
       found: what is known of the environment already.
+      trust: the code that the run of `init_from` names may be another user's.
 
     Raises:
       BadInput: the settings, the environment or the place of the run are not usable.
@@ -101,6 +118,7 @@ def start(overrides: Mapping[str, Any], display: Display, found: Probe | None = 
         prepared = examine(placed, overrides, found)
         TensorBoard.check(prepared.config)
         check_own_parts(prepared)
+        initial = read_initial(prepared, display.say, trust)
     path, made = _make_directory(prepared.config)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
     path = Path.cwd() / path
@@ -111,6 +129,7 @@ def start(overrides: Mapping[str, Any], display: Display, found: Probe | None = 
         "versions": run_directory.versions(),
         "git": run_directory.git_revision(),
         "machine": run_directory.machine(),
+        **({"initial": initial[1]} if initial else {}),
     }
     if folders := folders_of(stored):
         stored[KEY] = folders
@@ -119,6 +138,8 @@ def start(overrides: Mapping[str, Any], display: Display, found: Probe | None = 
         run = Run(path, prepared, made)
         try:
             run_directory.create(path)  # again, now that it is ours: another may have been faster
+            if initial:
+                save_initial(path, initial[0], run.manifest())
             run_directory.write_config(path, {**stored, "code": run.code})
         except BaseException:
             run.lock.close()
@@ -195,12 +216,15 @@ def reopen(
     display: Display,
     trust: bool = False,
     accept_changed_code: bool = False,
+    restart_schedule: bool = False,
 ) -> Run:
     """Opens an existing run, to be continued; from then on it counts as this user's.
 
     Args:
+      changes: of fields that `resume` may change; what extends the run is stored.
       trust: the code that it names may run, even if another user named it.
       accept_changed_code: go on with that code even if it is not what it was.
+      restart_schedule: schedules begin anew, over the steps that are added.
 
     Raises:
       BadInput: it is not a run, is in use, names code of somebody else's, or `changes` would change
@@ -209,20 +233,24 @@ def reopen(
     path = Path.cwd() / path  # an environment may go elsewhere
     stored = run_directory.read_config(path)
     check_trusted(stored, str(path), stored.get("seal"), trust)
-    resumable = fields_with("resumable")
+    resumable = (*fields_with("resumable"), *fields_with("extends_run"))
     for name in changes:
         if name not in resumable:
             raise BadInput(f"{name}: cannot be changed on resume (can: {', '.join(resumable)})")
     before = read_stored(stored)
     _check_source(path, stored)
-    changed = before.replace(**parse_all(changes))
+    parsed = parse_all(changes)
+    if restart_schedule:
+        parsed["schedule_start"] = check_restart(path, before.config, parsed)
+    changed = before.replace(**parsed)
+    check_extension(before.config, changed.config)
     check_consistent(changed.config)
     TensorBoard.check(changed.config)
     changed = place(changed)
     check_writes(changed.config)
     if (changed.config.backend == "device") != (before.config.backend == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
-    prepared = examine(changed, changes)
+    prepared = examine(changed, parsed)
     _check_spaces(prepared, path, stored["spaces"])
     with disk_errors(path):
         run = Run(path, prepared)
@@ -233,10 +261,20 @@ def reopen(
             f"{path} was trained with other code: {differs}; --accept-changed-code (in Python "
             f"accept_changed_code=True) goes on with today's"
         )
+    if text := newer_sources(stored.get("code", {}), run.code):
+        display.say(f"warning: {path} was trained with {text}: the rest may differ")
+    after = extension(before, changed)
     with disk_errors(path):
-        if trust or differs:
+        if goes_further(before.config, after.config):
+            run_directory.reopen_summary(path)
+        if after != before:
+            stored = {**stored, **to_stored(after), "extended": extended(stored, before)}
+        if trust or differs or after != before:
             stored = run_directory.with_code(stored, run.code) if differs else stored
             run_directory.write_config(path, {**stored, "seal": seal(stored)})
+    run.extended = stored.get("extended", [])
+    if text := describe_extension(before.config, after.config):
+        display.say(text)
     return run
 
 

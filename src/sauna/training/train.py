@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, fields_with, to_json
@@ -12,13 +15,25 @@ from sauna.envs.spaces import difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import check_logs, cut_logs, damage_of
-from sauna.training.coordinator import Coordinator
+from sauna.training.coordinator import Callback, Coordinator
 from sauna.training.display import Display
+from sauna.training.extension import GOES_FURTHER
+from sauna.training.initial import load_initial
 from sauna.training.run import Run, disk_errors
 
 
-def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False) -> bool:
+def train_run(
+    run: Run,
+    display: Display,
+    *,
+    resume: bool,
+    inexact: bool = False,
+    callback: Callback | None = None,
+) -> bool:
     """Trains a run to its end; returns when everything is written.
+
+    Args:
+      callback: sees each row of `metrics.jsonl`; its member stops if it returns True.
 
     Returns:
       False if it was complete already, so that nothing was done.
@@ -31,8 +46,10 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
     try:
         if inexact and run.config.backend == "device":
             raise BadInput("inexact: a run on the device brings its environments back exactly")
+        if callback is not None and run.config.distributed:
+            raise BadInput("callback: not called with distributed")
         with disk_errors(run.path):
-            return _train(run, display, resume, inexact)
+            return _train(run, display, resume, inexact, callback)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
             run_directory.discard(run.path, run.made)
@@ -41,7 +58,9 @@ def train_run(run: Run, display: Display, *, resume: bool, inexact: bool = False
         run.lock.close()
 
 
-def _train(run: Run, display: Display, resume: bool, inexact: bool) -> bool:
+def _train(
+    run: Run, display: Display, resume: bool, inexact: bool, callback: Callback | None
+) -> bool:
     loaded = None
     if resume:
         if run_directory.is_complete(run.path) and _is_whole(run, display):
@@ -49,7 +68,8 @@ def _train(run: Run, display: Display, resume: bool, inexact: bool) -> bool:
             return False
         loaded = _load(run, display)
         cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
-    with Coordinator(run, display, loaded, inexact) as coordinator:
+    initial = load_initial(run.path, run.config) if loaded is None else {}
+    with Coordinator(run, display, loaded, initial, inexact, callback) as coordinator:
         coordinator.run()
     return True
 
@@ -72,7 +92,7 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
     ours = run.manifest()
 
     def check(manifest: dict[str, Any]) -> None:
-        _check_same(run.path, ours, manifest)
+        _check_same(run.path, ours, manifest, run.extended)
         check_logs(run.path, manifest)
 
     loaded = checkpoint.load_newest(run.path / "checkpoints", display.say, check)
@@ -87,11 +107,35 @@ def _load(run: Run, display: Display) -> checkpoint.Checkpoint | None:
             f"warning: other versions than when the checkpoint was saved "
             f"({', '.join(changed)}): the rest may differ in its last bits"
         )
-    return loaded
+    return going_on(loaded, ours["config"]) if loaded else None
 
 
-def _check_same(path: Path, ours: dict[str, Any], manifest: dict[str, Any]) -> None:
+def going_on(loaded: checkpoint.Checkpoint, config: Mapping[str, Any]) -> checkpoint.Checkpoint:
+    """Lets members go on that were stopped early, if the run goes further than it did then.
+
+    That is if it has more steps, or another rule to stop.
+    """
+    before = {**to_json(Config()), **loaded.manifest["config"]}
+    if all(before[name] == config[name] for name in GOES_FURTHER):
+        return loaded
+    arrays = {
+        name: np.zeros_like(array) if name.endswith("/evaluation/since_best") else array
+        for name, array in loaded.arrays.items()
+        if not name.endswith("/counters/stopped")
+    }
+    return loaded._replace(arrays=arrays)
+
+
+def _check_same(
+    path: Path,
+    ours: dict[str, Any],
+    manifest: dict[str, Any],
+    extended: Sequence[Mapping[str, Any]] = (),
+) -> None:
     """Refuses a checkpoint that another config or environment wrote.
+
+    Args:
+      extended: the values that fields had before the run was extended.
 
     Raises:
       BadInput: with every field that differs.
@@ -101,7 +145,9 @@ def _check_same(path: Path, ours: dict[str, Any], manifest: dict[str, Any]) -> N
     differing = [
         f"{name} is {stored[name]!r}, not {value!r}"
         for name, value in ours["config"].items()
-        if name not in free and stored[name] != value
+        if name not in free
+        and stored[name] != value
+        and not any(before.get(name) == stored[name] for before in extended if name in before)
     ]
     try:
         spaces = difference(read_spaces(manifest["spaces"]), read_spaces(ours["spaces"]))

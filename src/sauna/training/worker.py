@@ -38,6 +38,7 @@ class PipeReporter:
         self._inbox, self._outbox, self._dies_alone = inbox, outbox, dies_alone
         self._granted = 0
         self._stop = False
+        self._stopped: set[str] = set()
         self._changed = threading.Condition()
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -48,6 +49,7 @@ class PipeReporter:
                 with self._changed:
                     self._granted = header["granted"]
                     self._stop = header["stop"]
+                    self._stopped |= set(header.get("stopped", ()))
                     self._changed.notify()
         except (EOFError, OSError):
             if self._dies_alone:
@@ -63,6 +65,10 @@ class PipeReporter:
         with self._changed:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
             return max(self._granted - iteration, 0)
+
+    def stopped(self) -> set[str]:
+        with self._changed:
+            return set(self._stopped)
 
     def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         header = {"kind": "iteration", "iteration": iteration, "rows": rows, "timing": timing}
@@ -132,12 +138,14 @@ def write_job(
     chosen: Sequence[int],
     start: int,
     replay: bool,
+    is_restored: bool,
 ) -> dict[str, Any]:
     """Writes the header of the message that starts a worker; a checkpoint's arrays go beside it.
 
     Args:
       chosen: the indices of the worker's members among those of `run`.
       start, replay: see `Job`.
+      is_restored: whether the arrays are those of this run, or what it starts from.
     """
     return {
         **to_stored(run),
@@ -145,6 +153,7 @@ def write_job(
         "members": list(chosen),
         "start": start,
         "replay": replay,
+        "is_restored": is_restored,
     }
 
 
@@ -153,7 +162,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
     prepared = Prepared(read_stored(header), read_spaces(header["spaces"]), None)
     return prepared.job(
         header["members"],
-        restored=arrays or None,
+        **{"restored" if header["is_restored"] else "initial": arrays or None},
         start=header["start"],
         replay=header["replay"],
     )

@@ -16,6 +16,8 @@ from sauna.algorithm.learner.samples import advantages_over_all, make_batch
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.types import Hypers, Rollout
 
+over_all = jax.jit(advantages_over_all, static_argnums=2)  # one program, not one per operation
+
 
 def hypers(**values: float) -> Hypers:
     start = dict.fromkeys(Hypers._fields, 0.0) | {"gamma": 0.9, "gae_lambda": 0.8}
@@ -45,11 +47,11 @@ def test_equals_a_plain_loop_in_both_precisions(bootstrap: bool) -> None:
     rollout = random_rollout(0)
     expected = loop_gae(rollout, 0.9, 0.8, bootstrap)
     with jax.enable_x64(True):
-        exact = advantages_over_all(jax.tree.map(jnp.asarray, rollout), hypers(), bootstrap)
+        exact = over_all(jax.tree.map(jnp.asarray, rollout), hypers(), bootstrap)
         assert exact.dtype == jnp.float64
         np.testing.assert_allclose(exact, expected, rtol=0, atol=1e-12)
     single = jax.tree.map(lambda x: jnp.asarray(x, np.float32) if x.dtype == float else x, rollout)
-    rounded = advantages_over_all(single, jax.tree.map(np.float32, hypers()), bootstrap)
+    rounded = over_all(single, jax.tree.map(np.float32, hypers()), bootstrap)
     assert rounded.dtype == jnp.float32
     np.testing.assert_allclose(rounded, expected, rtol=1e-5, atol=1e-5)
 
@@ -67,7 +69,7 @@ def test_by_hand() -> None:
 def test_lambda_0_is_the_temporal_difference_error(seed: int) -> None:
     r = random_rollout(seed)
     with jax.enable_x64(True):
-        got = advantages_over_all(jax.tree.map(jnp.asarray, r), hypers(gae_lambda=0.0), True)
+        got = over_all(jax.tree.map(jnp.asarray, r), hypers(gae_lambda=0.0), True)
         expected = r.reward + 0.9 * np.where(r.terminated, 0.0, r.next_value) - r.value
         np.testing.assert_allclose(got, expected, atol=1e-12)
 
@@ -77,7 +79,7 @@ def test_lambda_0_is_the_temporal_difference_error(seed: int) -> None:
 def test_lambda_1_is_the_discounted_sum_minus_the_value(seed: int) -> None:
     r = random_rollout(seed, envs=1)
     with jax.enable_x64(True):
-        got = advantages_over_all(jax.tree.map(jnp.asarray, r), hypers(gae_lambda=1.0), True)
+        got = over_all(jax.tree.map(jnp.asarray, r), hypers(gae_lambda=1.0), True)
     for t in range(len(r.reward)):
         total, discount = 0.0, 1.0
         for k in range(t, len(r.reward)):
@@ -97,10 +99,10 @@ def test_nothing_leaks_across_an_episode_end(seed: int, end: int) -> None:
     r.terminated[end - 1] = True
     r.truncated[end - 1] = False
     with jax.enable_x64(True):
-        before = advantages_over_all(jax.tree.map(jnp.asarray, r), hypers(), True)[:end]
+        before = over_all(jax.tree.map(jnp.asarray, r), hypers(), True)[:end]
         r.reward[end:] += 100.0
         r.value[end:] -= 50.0
-        after = advantages_over_all(jax.tree.map(jnp.asarray, r), hypers(), True)[:end]
+        after = over_all(jax.tree.map(jnp.asarray, r), hypers(), True)[:end]
     np.testing.assert_array_equal(before, after)
 
 
@@ -116,8 +118,8 @@ def test_truncation_reaches_the_endless_value_and_termination_must_miss_it() -> 
     )
     with jax.enable_x64(True):
         h = hypers(gae_lambda=0.95)
-        right = np.asarray(advantages_over_all(jax.tree.map(jnp.asarray, r), h, True)) + full
-        wrong = np.asarray(advantages_over_all(jax.tree.map(jnp.asarray, r), h, False)) + full
+        right = np.asarray(over_all(jax.tree.map(jnp.asarray, r), h, True)) + full
+        wrong = np.asarray(over_all(jax.tree.map(jnp.asarray, r), h, False)) + full
     np.testing.assert_allclose(right, endless, atol=1e-9)
     assert np.all(wrong[ends] < 2.0)
 

@@ -13,7 +13,7 @@ import pytest
 from helpers import SMALL, TESTS, Recorder, equal, make_job, own, resumed, train_here
 from jax_worlds import LENGTH, walk
 from sauna.algorithm.rollout.collected import capacity
-from sauna.algorithm.rollout.device import Collecting, collect, start
+from sauna.algorithm.rollout.device import WINDOW, Collecting, _ends, _Row, collect, start
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import Hypers, member_keys
@@ -50,6 +50,26 @@ class SteppedHere(HostEnvs):
             np.asarray(transition.observation, np.float64),
             bool((ends[0] | ends[1]).any()),
         )
+
+
+def test_the_means_of_a_row_are_over_all_episodes_also_where_only_the_latest_are_listed() -> None:
+    """As on the host; a number that an episode does not give counts for nothing."""
+    rng = np.random.default_rng(0)
+    shape = (80, 2)
+    rows = {name: np.zeros(shape, np.float32) for name in _Row._fields}
+    rows |= {name: np.ones(shape, bool) for name in ("terminated", "keep", "valid")}
+    rows |= {"truncated": np.zeros(shape, bool), "terminated": rng.random(shape) < 0.9}
+    rows["episode_return"], rows["episode_length"] = rng.normal(size=(2, *shape))
+    given = np.where(rng.random(shape) < 0.5, rng.normal(size=shape), np.nan)
+    rows["info"] = {"x": given, "never": np.full(shape, np.inf)}
+    ends = jax.jit(_ends)(_Row(**rows))
+    over = rows["terminated"]
+    returns = rows["episode_return"][over]
+    assert int(ends.number) == len(returns) > WINDOW
+    np.testing.assert_allclose(ends.return_mean, returns.mean(), rtol=1e-4)
+    np.testing.assert_allclose(ends.return_, returns[-WINDOW:], rtol=1e-6)
+    np.testing.assert_allclose(ends.info["x"], np.nanmean(given[over]), rtol=1e-4)
+    assert np.isnan(ends.info["never"])
 
 
 slow = pytest.mark.slow
@@ -287,8 +307,9 @@ def test_bad_input_is_refused(
 
 @slow
 def test_the_environment_of_the_docs_trains(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(TESTS).parent / "docs" / "device.md").read_text()
-    (tmp_path / "my_envs.py").write_text(text.split("```python\n")[1].split("```")[0])
+    text = (Path(TESTS).parent / "docs" / "how-to" / "gpu.md").read_text()
+    code = text.split('```python title="my_envs.py"\n')[1].split("```")[0]
+    (tmp_path / "my_envs.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     result = train_here(make_job("my_envs:near_zero", arm="ppo", envs=2))
     assert result.rows[-1]["env_steps"] == 128

@@ -14,12 +14,12 @@ from helpers import SMALL
 from sauna import cli
 from sauna.config.plugins import name_of
 from sauna.experiments.evaluate import episodes, play
-from sauna.experiments.evaluate.artifact import load_artifact
 from sauna.experiments.evaluate.episodes import VideoFailure, kwargs_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import check_drawn, frame, frames_per_second, video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.training.artifact import load_artifact
 
 SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 96}
 
@@ -28,7 +28,7 @@ SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 96}
 def run(tmp_path_factory) -> Path:
     """Of an environment with an argument, and three kept checkpoints."""
     path = tmp_path_factory.mktemp("evaluated") / "run"
-    kept = {"checkpoint_every": 1, "keep_checkpoints": 3}
+    kept = {"checkpoint_every": 1, "keep_checkpoints": 3, "eval_every": 32, "eval_episodes": 1}
     kwargs = {"first": 1000, "step": 2}  # no number is bad before episode 1000
     sauna.train("worlds:NotANumber", quiet=True, out=path, env_kwargs=kwargs, **SETTINGS, **kept)
     return path
@@ -93,6 +93,22 @@ def test_a_batch_gives_the_actions_of_its_observations(run: Path) -> None:
     for wrong in (np.ones(4), np.ones((1, 20)), {"goal": np.ones(3)}, np.ones((0, 3))):
         with pytest.raises(BadInput, match=r"expected \(3,\), one observation or a batch|is empty"):
             policy(wrong)
+
+
+def test_the_best_policy_is_that_of_the_best_evaluation(run: Path, endless: Path, capsys) -> None:
+    """Which is the checkpoint after it, as there is one after every iteration here."""
+    evaluations = {row["iteration"]: row["eval_return_mean"] for row in run_directory.rows(run)}
+    best = max(evaluations, key=lambda iteration: evaluations[iteration])
+    played = sauna.evaluate(run, episodes=2, best=True)
+    assert played["members"] == sauna.evaluate(run, episodes=2, checkpoint=best + 1)["members"]
+    assert played["best"] == {"ppo/0": 32 * (best + 1)}
+    assert (run / "evaluation_best_sampled.json").exists()
+    expected = sauna.load(run, checkpoint=best + 1)(np.ones(3))
+    np.testing.assert_array_equal(sauna.load(run, best=True)(np.ones(3)), expected)
+    cli.main(["eval", str(run), "--episodes", "1", "--best"])
+    assert f"ppo/0 (best, after {32 * (best + 1)} env steps)" in capsys.readouterr().out
+    with pytest.raises(BadInput, match="best: ppo/0 was not evaluated during training"):
+        sauna.load(endless, best=True)
 
 
 def test_an_episode_without_an_end_is_cut_and_that_is_said(endless: Path, capsys) -> None:

@@ -116,7 +116,7 @@ def test_shares_and_pairs_by_hand() -> None:
     assert math.isclose(pair.p, 2 * (1 + 11 + 55) / 2**11)
     said = posture_report.verdicts(found)
     assert said[0] == "ppo: on its feet in 5 of 20 seeds (25% [11%, 47%])."
-    assert "no evidence of a difference (20 pairs; only sauna on its feet in 9" in said[2]
+    assert "not decided (20 pairs; only sauna on its feet in 9" in said[2]
 
 
 def test_a_difference_is_told_and_equal_ones_are_not() -> None:
@@ -216,7 +216,7 @@ threshold = 0.8
     done = sauna(*command, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "measuring posture: 4 members" in done.stdout
-    assert "sauna 0.8 against ppo, seed by seed: no evidence" in done.stdout
+    assert "sauna 0.8 against ppo, seed by seed: not decided" in done.stdout
     place = tmp_path / "runs" / "small"
     [*files] = sorted((place / "posture").glob("*.json"))
     stored = [json.loads(file.read_text()) for file in files]

@@ -71,7 +71,7 @@ def make_results(
                     "arm": label.split()[0],
                     "preset": "mujoco",
                     "members": members,
-                    "config": {"steps": 100_000, "threshold": 0.1 * place, "note": mark},
+                    "config": {"steps": 1_000_000, "threshold": 0.1 * place, "note": mark},
                     "command": f"sauna train {task} --arm {label} {mark}",
                 }
             )
@@ -233,7 +233,7 @@ def test_failed_seeds_settings_and_commands_are_shown(report) -> None:
     assert "sauna compare --seeds 5" in page.text
     assert page.text.count("sauna train ") == 8
     assert ["threshold", "0.2", "0.0"] in page.rows  # the last is where the baseline differs
-    assert ["steps", "100000", ""] in page.rows
+    assert ["steps", "1000000", ""] in page.rows
     assert ["git revision", "-"] in page.rows
     assert sum(row[1:2] == ["failed"] for row in page.rows) == 1
 
@@ -254,6 +254,8 @@ def test_the_papers_numbers_do_not_stand_beside_another_algorithm() -> None:
     found = tables.paper(ppo, {"table": [row]})
     assert found is not None and found["rows"][0]["printed"][0].startswith("2,106")
     assert tables.paper({"cells": [cell]}, {"table": [row]}) is None
+    short = {"cells": [{**cell, "config": {"steps": 100_000}}]}
+    assert tables.paper(short, {"table": [row]}) is None  # the paper's has 10^6 steps
 
 
 def test_nothing_is_fetched(report) -> None:
@@ -365,7 +367,7 @@ def test_the_title_is_the_question_and_the_first_sentence_its_answer(tmp_path, r
     body = page.text[page.text.index(title, page.text.index(title) + 1) :]  # behind <title>
     better = [v for v in summary["verdicts"] if v["kind"] == "better"]
     assert [(v["label"], v["task"]) for v in better] == [("sauna 0.8", "HalfCheetah-v5")]
-    answer = "Better: sauna 0.8 on HalfCheetah-v5; no evidence of a difference: 5 of 6 comparisons."
+    answer = "Better: sauna 0.8 on HalfCheetah-v5; not decided: 5 of 6 comparisons."
     assert body[len(title) :].lstrip().startswith(answer)
     own = make_results(tasks=("Reacher-v5",), seeds=1)
     own["cells"] = own["cells"][:2]

@@ -10,7 +10,8 @@ import pytest
 from matplotlib import image
 
 from command_line import sauna
-from sauna.experiments.report.curve import plot
+from sauna.experiments.report import curve
+from sauna.experiments.report.curve import draw_curve, plot
 from sauna.experiments.report.sources import Curve, Source, read_scalars, read_sources
 from sauna.experiments.study.existing import compare_existing, results_of
 from sauna.system.errors import BadInput
@@ -59,6 +60,18 @@ def test_a_csv_file_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(source.seeds[3].y, [1.5, 3.5])
     others = write_csv(tmp_path / "other.csv", 1.0, 2000, head="seed,global_step,episodic_return")
     assert read_sources([others])[0].seeds[0].x.tolist() == [0, 1000, 2000]
+
+
+def test_a_curve_that_cannot_be_drawn_costs_no_training(tmp_path: Path, capsys) -> None:
+    run = write_run(tmp_path / "run")
+    (tmp_path / "elsewhere").mkdir()
+    (run / "figures").symlink_to(tmp_path / "elsewhere")
+    assert draw_curve(run) is None
+    said = capsys.readouterr().err
+    assert said.startswith("warning: no learning curve was drawn: Untrusted") and "link" in said
+    assert said.count("\n") == 1 and not list((tmp_path / "elsewhere").iterdir())
+    (run / "figures").unlink()
+    assert draw_curve(run) == run / "figures" / "learning_curve.png"
 
 
 def test_the_table_of_a_run_gives_the_curves_of_the_run(tmp_path: Path) -> None:
@@ -128,6 +141,27 @@ def test_run_directories_are_read_arm_by_arm(tmp_path: Path) -> None:
         read_sources([one])
 
 
+def test_evaluations_are_drawn_beside_the_training_return(tmp_path: Path, monkeypatch) -> None:
+    drawn: list[tuple[str, list[float]]] = []
+    monkeypatch.setattr(
+        curve,
+        "_draw_arm",
+        lambda axes, label, members, look: drawn.append(
+            (label, [y for _, line in members.values() for y in line])
+        ),
+    )
+    rows = [
+        {"arm": "ppo", "member": "ppo/0", "seed": 0, "iteration": i, "env_steps": 10 * i}
+        | {"return_mean": float(i)}
+        | ({"eval_return_mean": 7.0} if i == 2 else {})
+        for i in range(3)
+    ]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "config.json").write_text(json.dumps({"config": {"env": "A", "preset": "p"}}))
+    assert plot([tmp_path]) == tmp_path / "figures" / "learning_curve.png"
+    assert drawn == [("ppo", [0.0, 1.0, 2.0]), ("ppo, evaluations", [7.0])]
+
+
 def test_only_steps_that_all_curves_have_are_compared() -> None:
     """The longer curve is cut where the shorter one ends; the last tenth of that is the score."""
     x = np.arange(0.0, 2001.0, 100.0)
@@ -149,6 +183,7 @@ def test_a_comparison_says_where_each_arm_ends_and_writes_a_report(tmp_path: Pat
     )
     said = compare_existing([low, high], out=str(tmp_path / "out"))
     assert said[0] == "compared up to 18k env steps; the arms end: low at 20k, high at 18k"
+    assert said[1].startswith("final return here: mean of the returns from 16.2k to 18k env steps")
     assert any("high: better than low" in line and "exact p = 0.029" in line for line in said)
     [report] = (tmp_path / "out").glob("*/report.html")
     page = report.read_text()

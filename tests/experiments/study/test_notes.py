@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from sauna.experiments.statistics import compare, least_seeds
+from sauna.experiments.study.cells import Cell
 from sauna.experiments.study.command import comparison
 from sauna.experiments.study.notes import before_training
+from sauna.experiments.study.verdicts import least_of
 
 ARMS = ("ppo", "vex-head", "sauna+random", "sauna")
 
@@ -19,7 +21,17 @@ def test_a_comparison_of_too_few_seeds_is_named_underpowered(arms: tuple[str, ..
         spec = comparison("x", arms, {"seeds": tuple(range(number))})
         said = before_training(spec)
         assert bool(said) == (number < needed)
-        assert all(f"--seeds {needed}" in line and "underpowered" in line for line in said)
+        assert all(f"--seeds {needed}" in line and "too few seeds" in line for line in said)
+
+
+def test_the_number_of_seeds_is_that_of_the_sentences() -> None:
+    """One rule and its control are two families of one test each, and one ablation."""
+    arms = ("ppo", "top-advantage", "top-advantage+random")
+    (said,) = before_training(comparison("x", arms, {"seeds": (0, 1, 2)}))
+    assert least_seeds(1) == 4 < least_seeds(2) and said.endswith("--seeds 4")
+    cells = [Cell("x", arm, arm, "ppo" if arm != "ppo" else None, [], 0, 0, 0) for arm in arms]
+    assert least_of(cells) == 4
+    assert least_of([*cells, cells[1]._replace(label="other", arm="gigaflow")]) == 5
 
 
 def test_it_says_so_exactly_when_no_result_could_be_found() -> None:

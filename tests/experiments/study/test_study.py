@@ -124,6 +124,17 @@ def test_the_auc_is_that_of_the_budget() -> None:
     assert _ended([], 400)["auc"] is None
 
 
+def test_a_member_that_stopped_early_keeps_its_last_return() -> None:
+    rows = [{"env_steps": n, "return_mean": n / 100, "samples_backward": 5.0} for n in (100, 200)]
+    ended = _ended(rows, 400, stopped_early=True)
+    assert ended["auc"] == (1.5 * 100 + 2.0 * 200) / 300
+    assert (ended["env_steps"], ended["final_return"], ended["samples_backward"]) == (200, 2.0, 10)
+    assert ended["curve"]["env_steps"] == [100, 200, 400]
+    assert ended["curve"]["return_mean"] == [1.0, 2.0, 2.0]
+    assert ended["curve"]["samples_backward"] == [5.0, 10.0, 10.0]
+    assert _ended(rows, 400)["auc"] == 1.5
+
+
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('tasks = ["A-v0"]\nseeds = [4, 9]\nsteps = 1e5\n[[arms]]\nlabel = "ppo"\n')

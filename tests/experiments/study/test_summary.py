@@ -13,7 +13,10 @@ import numpy as np
 import pytest
 
 from sauna.experiments import statistics as s
+from sauna.experiments.report.figures import plots_of
+from sauna.experiments.study.report import make_page
 from sauna.experiments.study.summary import summarize
+from sauna.experiments.study.text import lines
 from sauna.system.errors import BadInput
 
 STEPS = [1000, 2000, 3000]
@@ -32,6 +35,8 @@ ROW = {
     "final_mean",
     "final_std",
     "keep_rate",
+    "sampler",
+    "sample_rate",
     "env_steps",
     "kept_steps",
     "samples_backward",
@@ -102,8 +107,42 @@ def test_better_worse_and_no_evidence() -> None:
     assert (worse["kind"], worse["text"][:29]) == ("worse", "sauna: worse than ppo on Chee")
     alike = verdict(cell("ppo", LOW), cell("sauna", ALIKE, keep_rate=0.7))
     assert alike["kind"] == "no evidence"
-    assert alike["text"].startswith("sauna: no evidence of a difference from ppo on Cheetah (p")
+    assert alike["text"].startswith("sauna: not decided against ppo on Cheetah (p")
     assert "more than 1000 seeds of each would be needed" in alike["text"]
+
+
+def test_what_a_sampler_leaves_out_is_shown() -> None:
+    top = cell("top-advantage", HIGH, sample_rate=0.5)
+    top["config"] = {"sampler": "top-advantage"}
+    top["members"][0]["curve"]["sample_rate"] = [0.5] * 3
+    plain = results(cell("ppo", LOW, sample_rate=1.0))
+    sampled = results(cell("ppo", LOW, sample_rate=1.0), top)
+    head, ppo, rule = lines(summarize(sampled))[:3]
+    assert "keep rate  samples used" in head and "1.000      0.500" in rule
+    assert "1.000      1.000" in ppo
+    assert "samples used" not in lines(summarize(plain))[0]
+    page = make_page(sampled, summarize(sampled))
+    assert page.count("Samples used</th>") == 3 and "0.500" in page  # the table, and two of seeds
+    assert make_page(plain, summarize(plain)).count("Samples used</th>") == 1
+    drawn = {
+        p.name: [x.label for x in p.panels[0].lines] for p in plots_of(sampled, summarize(sampled))
+    }
+    assert drawn["keep_rate"] == ["ppo", "top-advantage"] and drawn["samples_used"] == [
+        "top-advantage"
+    ]
+
+
+def test_a_head_that_is_not_trained_is_not_drawn() -> None:
+    ppo, head = cell("ppo", LOW), cell("vex-head", HIGH)
+    for one, weight in ((ppo, 0.0), (head, 0.5)):
+        one["config"] = {"vex_coef": weight}
+        for of_seed in one["members"]:
+            of_seed["curve"]["vex_mean"] = [0.1, 0.2, 0.3]
+    found = results(ppo, head)
+    drawn = {
+        p.name: [x.label for x in p.panels[0].lines] for p in plots_of(found, summarize(found))
+    }
+    assert drawn["vex"] == ["vex-head"]
 
 
 def test_no_difference_at_all_names_no_number_of_seeds() -> None:
@@ -115,9 +154,8 @@ def test_too_few_seeds_says_how_many() -> None:
     found = verdict(cell("ppo", LOW[:3]), cell("sauna", HIGH[:3], keep_rate=0.7))
     assert found["kind"] == "underpowered"
     assert found["text"] == (
-        "sauna: too few seeds to say anything against ppo on Cheetah: 3 against 3 ended; at "
-        "least 4 of each are needed, and about 6 for a difference as large as the one seen, were "
-        "it the true one (80% power)."
+        "sauna: too few seeds to decide against ppo on Cheetah: 3 and 3 seeds have ended; at "
+        "least 4 of each are needed."
     )
     one = verdict(cell("ppo", LOW), cell("sauna", HIGH[:1], keep_rate=0.7))["text"]
     assert "1 against 6 ended; at least 4 of each are needed." in one
@@ -275,6 +313,10 @@ def test_a_filter_is_compared_with_its_head_only_ablation_and_its_random_control
     assert [v["kind"] for v in found["verdicts"]] == ["better"] * 4
     found_of = {v["against"]: v for v in found["filtering"]}
     assert set(found_of) == {"vex-head", "control"}
+    assert "head-only" in found["about_filtering"] and "control" in found["about_filtering"]
+    without_head = summarize(results(*arms[:1], *arms[2:]))["about_filtering"]
+    assert "head" not in without_head and "control" in without_head
+    assert summarize(results(*arms[:1]))["about_filtering"] == ""
     assert [(v["label"], v["kind"]) for v in found_of.values()] == [("sauna", "better")] * 2
     assert "sauna: better than control on Cheetah" in found_of["control"]["text"]
     assert (
@@ -414,7 +456,8 @@ def test_curves() -> None:
     summary = summarize(results(cell("ppo", [2.0, 4.0, 6.0])))
     curve = summary["curves"]["Cheetah"]["ppo"]
     assert curve["env_steps"] == STEPS
-    assert set(curve) == {"env_steps", "return_mean", "keep_rate", "vex_mean", "explained_variance"}
+    shares = {"keep_rate", "sample_rate"}
+    assert set(curve) == {"env_steps", "return_mean", "vex_mean", "explained_variance", *shares}
     assert curve["return_mean"]["mean"] == [None, 2.0, 4.0]
     assert curve["return_mean"]["low"][0] is None and curve["return_mean"]["low"][2] < 2
     assert curve["vex_mean"] == {end: [None] * 3 for end in ("mean", "low", "high")}

@@ -43,7 +43,7 @@ def learn(
     if needs_selection(parts):
         state, totals = update_on_selected(state, batch, rollout, hypers, order, key, parts=parts)
         losses, gradient_norm, work = _means(totals, batch, rollout, parts)
-        sound = jnp.isfinite(totals.losses.total)
+        is_finite = jnp.isfinite(totals.losses.total)
     else:
         learned_from = batch
         if config.normalize_over != "minibatch":
@@ -53,7 +53,7 @@ def learn(
             state, learned_from, hypers, order, parts=parts
         )
         work = _all_work(batch, losses, parts)
-        sound = jnp.isfinite(losses.total)
+        is_finite = jnp.isfinite(losses.total)
     metrics = UpdateMetrics(
         losses.policy_loss,
         losses.value_loss,
@@ -67,7 +67,7 @@ def learn(
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
         policy_std(parts.policy.unravel(state.params)),
-        sound & jnp.all(jnp.isfinite(state.params)),
+        is_finite & jnp.all(jnp.isfinite(state.params)),
         work,
     )
     return state, metrics
@@ -81,16 +81,16 @@ def _means(
     steps = totals.steps.astype(jnp.float32)
     rows = config.rollout_steps * config.envs
     epochs = totals.epochs.astype(jnp.float32)
-    looks: Any = 0.0
+    only_forward: Any = 0.0
     if sampler is not None and sampler.reads_policy:
-        looks = rows * (epochs if sampler.each_epoch else 1.0)
+        only_forward = rows * (epochs if sampler.each_epoch else 1.0)
     if config.recompute_advantages:
-        looks += rollout.vex.size * epochs
+        only_forward += rollout.vex.size * epochs
     present = jnp.sum(batch.weight)
     work = Work(
         gradient_steps=steps,
         sample_rate=totals.drawn / (epochs * present),
-        samples_forward=totals.rows + looks,
+        samples_forward=totals.rows + only_forward,
         samples_backward=totals.rows.astype(jnp.float32),
         effective_sample_size=totals.effective_size / steps,
     )

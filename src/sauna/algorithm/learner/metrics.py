@@ -14,8 +14,8 @@ class Work(NamedTuple):
     """What one iteration's update took; `[]` each."""
 
     gradient_steps: Array
-    sample_rate: Array  # rows that the policy loss draws per epoch, of those that are there
-    samples_forward: Array  # rows through the network, with those that a rule only looks at
+    sample_rate: Array  # rows that the policy loss draws per epoch, of the rollout's
+    samples_forward: Array  # rows through the network, with those that only a rule needs
     samples_backward: Array  # rows through its gradient, also of a step that a stop rule forbids
     effective_sample_size: Array  # (sum w)^2 / sum w^2 of a minibatch's policy weights, the mean
 

@@ -1,6 +1,6 @@
 """The update under a rule of selection: choose rows, then run as many minibatches as they fill.
 
-Without a rule `update.update_on_all` runs instead, so that PPO's bits are PPO's. Here the number of
+Without a rule `update.update_on_all` runs instead: PPO, bit for bit. Here the number of
 gradient steps is known only while the program runs. No gradient flows through that loop, and time
 is spent on the steps that are run. Members that are compiled together run the most steps of any.
 """

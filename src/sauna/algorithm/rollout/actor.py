@@ -57,7 +57,7 @@ class CompiledActor:
 
 
 class MLPActor:
-    """Acts by a compiled loop, for the MLP trunks of `core.networks`.
+    """Acts by a compiled loop, for the MLP trunks of `policy/networks.py`.
 
     Each layer's weights have a last row, the biases.
     """
@@ -158,7 +158,7 @@ def _tanh(y: Any) -> None:
 
 
 def _sampler(spaces: Spaces) -> Callable[[np.ndarray], np.ndarray]:
-    """From the policy head's outputs plus noise to actions, as `core.distributions` has it."""
+    """From the policy head's outputs plus noise to actions, as `policy/distributions.py` has it."""
     if spaces.action_kind == "continuous":
         return lambda noisy: noisy
     if spaces.action_kind == "multi_binary":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from sauna.algorithm.types import Rollout
@@ -30,15 +30,6 @@ class Collected(NamedTuple):
     length_mean: float
     episodes: list[Episode]  # the latest of them; on the host all
     info: Mapping[str, float]  # means over all that gave the number in their last `info`
-
-
-def info_means(infos: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """The mean of each number over the episodes that gave it, in the order of their names."""
-    found: dict[str, list[float]] = {}
-    for info in infos:
-        for name, number in info.items():
-            found.setdefault(name, []).append(number)
-    return {name: sum(found[name]) / len(found[name]) for name in sorted(found)}
 
 
 def capacity(config: Config) -> int:

@@ -23,11 +23,12 @@ from sauna.algorithm.policy.normalize import (
     scale_rewards,
 )
 from sauna.algorithm.rollout.actor import make_actor
-from sauna.algorithm.rollout.collected import Collected, Episode, capacity, info_means
+from sauna.algorithm.rollout.collected import Collected, Episode, capacity
 from sauna.algorithm.rollout.moments import ObservationMoments, discounted_returns
 from sauna.algorithm.rollout.program import Program
 from sauna.algorithm.types import Hypers, Keys, Rollout, ScoredStep
 from sauna.envs.host.contract import HostEnvs, Step
+from sauna.envs.info import info_means
 from sauna.envs.spaces import Spaces
 
 _fold_in = jax.jit(jax.random.fold_in)  # compiled: rollouts of few steps draw a key often

@@ -1,8 +1,8 @@
 """Running normalisation on the host: observations step by step, rewards a rollout at a time.
 
-The arithmetic is `core.normalize`'s. Observations enter their moments before the policy sees
-them, so those are updated at every vector step, in place, by a compiled loop. Rewards are learned
-from only after the rollout, and are scaled then.
+The arithmetic is that of `policy/normalize.py`. Observations enter their moments before the policy
+sees them, so those are updated at every vector step, in place, by a compiled loop. Rewards are
+learned from only after the rollout, and are scaled then.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ObservationMoments:
 
 @compiled
 def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) -> None:
-    """`core.normalize.update_moments`, in place."""
+    """`policy.normalize.update_moments`, in place."""
     members, envs, size = observation.shape
     for p in range(members):
         number = acting[p].sum()
@@ -78,7 +78,7 @@ def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) ->
 def _normalize(
     observation: Any, mean: Any, variance: Any, epsilon: float, clip: float, out: Any
 ) -> None:
-    """`core.normalize.normalize`, written to `out`."""
+    """`policy.normalize.normalize`, written to `out`."""
     members, envs, size = observation.shape
     for p in range(members):
         for n in range(envs):

@@ -1,4 +1,4 @@
-"""The compiled functions of collecting. Here alone a leading axis of members exists."""
+"""The compiled functions of collecting; `act` takes all members of a process at once."""
 
 from __future__ import annotations
 

@@ -34,9 +34,9 @@ def matched(
     if kind == "low-advantage":
         return largest(-jnp.abs(advantage), count, eligible)
     if kind == "reversed":
-        dealt = jnp.argsort(noise)  # ranks break ties by the row: rows in random order
-        chosen = largest(-score[dealt], count, eligible[dealt])
-        return jnp.zeros_like(keep).at[dealt].set(chosen)
+        shuffled = jnp.argsort(noise)  # ranks break ties by the row: rows in random order
+        chosen = largest(-score[shuffled], count, eligible[shuffled])
+        return jnp.zeros_like(keep).at[shuffled].set(chosen)
     place = (jnp.cumsum(eligible) - 1).astype(jnp.uint32)
     number = jnp.sum(eligible).astype(jnp.uint32)
     many = jnp.maximum(count, 1).astype(jnp.uint32)
@@ -73,7 +73,7 @@ def controlled(kind: str, sampler: Sampler) -> Sampler:
 
 
 def _reversed_probabilities(choice: Choice, present: Array) -> Choice:
-    def turned(value: Array | None, score: Array) -> Array | None:
+    def reversed_ranks(value: Array | None, score: Array) -> Array | None:
         if value is None:
             return None
         rank = ranks(score, present)
@@ -82,23 +82,23 @@ def _reversed_probabilities(choice: Choice, present: Array) -> Choice:
 
     value_p = choice.value_probability
     return Choice(
-        probability=turned(choice.probability, choice.score),
-        weight=turned(choice.weight, choice.score),
-        value_probability=turned(value_p, value_p) if value_p is not None else None,
-        value_weight=turned(choice.value_weight, value_p) if value_p is not None else None,
+        probability=reversed_ranks(choice.probability, choice.score),
+        weight=reversed_ranks(choice.weight, choice.score),
+        value_probability=reversed_ranks(value_p, value_p) if value_p is not None else None,
+        value_weight=reversed_ranks(choice.value_weight, value_p) if value_p is not None else None,
         score=choice.score,
     )
 
 
 def controlled_weight(kind: str, rule: LossWeight) -> LossWeight:
-    """A loss weight whose values are dealt to other rows of the minibatch.
+    """A loss weight whose values are given to other rows of the minibatch.
 
-    A minibatch's rows stand in random order: handing each row the weight of the row before it, of
-    those present, is dealing them at random. `reversed` hands the largest weight to the row that
-    had the smallest.
+    A minibatch's rows stand in random order, so that each row gets a random one's weight if it gets
+    that of the present row before it. `reversed` gives the largest weight to the row that had the
+    smallest.
     """
 
-    def dealt(terms: LossTerms) -> tuple[Array, Array]:
+    def weight(terms: LossTerms) -> tuple[Array, Array]:
         mask, scale = rule.weight(terms)
         if kind == "reversed":
             rank = ranks(scale * mask, terms.present > 0)
@@ -112,7 +112,7 @@ def controlled_weight(kind: str, rule: LossWeight) -> LossWeight:
         before = rows[(jnp.cumsum(present) - 2) % jnp.maximum(number, 1)]
         return mask[before] * terms.present, scale[before]
 
-    return rule._replace(weight=dealt)
+    return rule._replace(weight=weight)
 
 
 def controlled_filter(kind: str, keep: Array, advantage: Array, valid: Array, key: Array) -> Array:

@@ -74,11 +74,11 @@ def ended_where_broken(transition: Transition) -> Transition:
 
     For physics alone, where that is a known end; other environments are reported as faulty.
     """
-    sound = jnp.all(jnp.isfinite(transition.observation)) & jnp.isfinite(transition.reward)
-    terminated = transition.terminated | ~sound
+    is_finite = jnp.all(jnp.isfinite(transition.observation)) & jnp.isfinite(transition.reward)
+    terminated = transition.terminated | ~is_finite
     return transition._replace(
-        observation=jnp.where(sound, transition.observation, 0.0),
-        reward=jnp.where(sound, transition.reward, 0.0),
+        observation=jnp.where(is_finite, transition.observation, 0.0),
+        reward=jnp.where(is_finite, transition.reward, 0.0),
         terminated=terminated,
         truncated=transition.truncated & ~terminated,
     )

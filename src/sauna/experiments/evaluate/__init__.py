@@ -1,3 +1,3 @@
 """A trained policy: read from a run, and played."""
 
-MAX_STEPS = 30_000  # env steps after which an episode is cut; Atari's time limit is 27,000
+from sauna.algorithm.rollout import MAX_STEPS as MAX_STEPS

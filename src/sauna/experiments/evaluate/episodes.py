@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,12 +15,21 @@ from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.artifact import Artifact, check_spaces, find_member, load_artifact
-from sauna.experiments.evaluate.play import Episode, Progress, play
+from sauna.experiments.evaluate.play import Progress
 from sauna.experiments.evaluate.video import check_drawn, record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.working_folder import kept_folder
+from sauna.training.artifact import (
+    Artifact,
+    best_steps,
+    check_spaces,
+    find_member,
+    load_artifact,
+)
+
+if TYPE_CHECKING:
+    from sauna.algorithm.rollout.play import Episode
 
 
 class VideoFailure(SaunaError):
@@ -45,6 +54,7 @@ def evaluate(
     checkpoint: int | None = None,
     max_steps: int = MAX_STEPS,
     video: bool = False,
+    best: bool = False,
     trust: bool = False,
     say: Callable[[str], None] = print,
     **parts: Any,
@@ -64,6 +74,7 @@ def evaluate(
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       max_steps: env steps after which an episode that has not ended is cut.
       video: also records the first member's first episode.
+      best: each member as it was at its best evaluation during training.
       trust: the code that the run names may run, even if another user named it.
       say: is called with a line about checkpoints that cannot be trusted, progress, and episodes
         that were cut.
@@ -73,8 +84,8 @@ def evaluate(
       `{"mode", "env", "seed", "members": {name: {"returns", "lengths", "mean", ...}}}`.
 
     Raises:
-      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces, or a
-        video was asked for and it has no pictures.
+      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces; with
+        `best`, a member was not evaluated during training; with `video`, `env` has no pictures.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
     run = Path.cwd() / run  # an environment may go elsewhere
@@ -90,6 +101,7 @@ def evaluate(
         "env": env or own,
         "seed": seed,
         "iteration": artifact.checkpoint.manifest["iteration"],
+        **({"best": best_steps(artifact, chosen)} if best else {}),
         "members": {},
     }
     kwargs = kwargs_of(artifact, env, env_kwargs)
@@ -99,10 +111,11 @@ def evaluate(
         check_drawn(result["env"], kwargs)
     made = make_env(result["env"], kwargs)
     check_spaces(artifact, made)
-    from sauna.experiments.evaluate.policy import TrainedPolicy  # imports JAX, so after the checks
+    from sauna.algorithm.rollout.play import play  # imports JAX, so after the checks
+    from sauna.experiments.evaluate.policy import TrainedPolicy
 
     for name in chosen:
-        policy = TrainedPolicy(artifact, name, made)
+        policy = TrainedPolicy(artifact, name, made, best)
         progress = Progress(name, episodes, say)
         played = [
             progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
@@ -112,16 +125,15 @@ def evaluate(
         progress.say_cut(max_steps)
     close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
-        run_directory.write_json(run / f"evaluation_{mode}.json", result)
+        run_directory.write_json(run / f"evaluation_{'best_' * best}{mode}.json", result)
     if video:
-        label = f"{chosen[0].replace('/', '-')}_{mode}" + f"_{checkpoint}" * (
+        label = f"{chosen[0].replace('/', '-')}_{'best_' * best}{mode}" + f"_{checkpoint}" * (
             checkpoint is not None
         )
         path = run / "videos" / f"{label}.mp4"
+        how = deterministic, seed, max_steps, best
         try:
-            record_video(
-                path, artifact, chosen[0], result["env"], kwargs, deterministic, seed, max_steps
-            )
+            record_video(path, artifact, chosen[0], result["env"], kwargs, *how)
         except SaunaError as error:
             raise VideoFailure(str(error), result) from error
         result["video"] = str(path)
@@ -175,8 +187,10 @@ def report(result: dict[str, Any]) -> list[str]:
         f"checkpoint of iteration {result['iteration']}"
     ]
     for name, row in result["members"].items():
+        best = result.get("best", {})
+        at = f" (best, after {best[name]:,} env steps)" if best else ""
         lines.append(
-            f"{name}: return {row['mean']:.2f} +- {row['std']:.2f} "
+            f"{name}{at}: return {row['mean']:.2f} +- {row['std']:.2f} "
             f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
             f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
             f"{row['episodes']} episodes"

@@ -1,55 +1,15 @@
-"""One episode with a frozen policy and a frozen normaliser."""
+"""How far an evaluation is."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-from sauna.envs.host.answers import one_number, reset_with
-from sauna.experiments.evaluate import MAX_STEPS
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sauna.experiments.evaluate.policy import TrainedPolicy
+    from sauna.algorithm.rollout.play import Episode
 
 QUIET = 10.0  # seconds without a word, after which an evaluation says how far it is
-
-
-class Episode(NamedTuple):
-    """One episode as it was played."""
-
-    return_: float  # of raw rewards
-    length: int  # env steps
-    cut: bool  # whether it had not ended
-
-
-def play(
-    policy: TrainedPolicy,
-    env: Any,
-    deterministic: bool,
-    seed: int,
-    watch: Callable[[], None] = lambda: None,
-    max_steps: int = MAX_STEPS,
-) -> Episode:
-    """One episode, cut after `max_steps` env steps.
-
-    Args:
-      watch: called after the reset and after each env step.
-    """
-    import jax
-
-    key = jax.random.key(seed)
-    observation = reset_with(env, seed)
-    watch()
-    return_, length, ended = 0.0, 0, False
-    while not ended and length < max_steps:
-        step_key = None if deterministic else jax.random.fold_in(key, length)
-        action = policy(observation, deterministic=deterministic, key=step_key)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        return_, length = return_ + one_number(reward), length + 1
-        ended = bool(terminated or truncated)
-        watch()
-    return Episode(return_, length, not ended)
 
 
 class Progress:

@@ -15,10 +15,9 @@ import numpy as np
 
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_drawn_env, make_env
-from sauna.experiments.evaluate.artifact import Artifact
-from sauna.experiments.evaluate.play import play
 from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.safe_write import own_folder, replacing
+from sauna.training.artifact import Artifact
 
 NEEDED = "video: a video needs an environment that takes render_mode='rgb_array' and has render()"
 
@@ -62,12 +61,14 @@ def record_video(
     deterministic: bool,
     seed: int,
     max_steps: int,
+    best: bool = False,
 ) -> None:
     """Records one episode to an mp4 file; without an episode there is no file.
 
     Raises:
       SaunaError: the environment cannot render on this machine, or gives no pictures.
     """
+    from sauna.algorithm.rollout.play import play
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
     choose_renderer()
@@ -76,7 +77,7 @@ def record_video(
         with replacing(path) as part:
             drawn = make_drawn_env(env, env_kwargs)
             try:
-                policy = TrainedPolicy(artifact, member, drawn)
+                policy = TrainedPolicy(artifact, member, drawn, best)
                 with video(part, frames_per_second(drawn)) as add:
                     play(policy, drawn, deterministic, seed, lambda: add(drawn.render()), max_steps)
             finally:

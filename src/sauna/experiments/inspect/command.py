@@ -7,10 +7,10 @@ from pathlib import Path
 
 from sauna.config.imported_from import names_the_folder
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.artifact import find_member, load_artifact
 from sauna.system.errors import BadInput
 from sauna.system.safe_write import replace_file
 from sauna.system.working_folder import kept_folder
+from sauna.training.artifact import find_member, load_artifact
 
 
 @names_the_folder

@@ -18,13 +18,13 @@ from sauna.config.settings import Config
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.artifact import Artifact
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frames_per_second
 from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
 from sauna.experiments.inspect.recording import Played, open_env, play_episodes, play_steps
 from sauna.system import run_directory
 from sauna.system.checkpoint import BadCheckpoint
+from sauna.training.artifact import Artifact
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, under
 

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.algorithm.rollout.play import play
 from sauna.envs.host.answers import life_lost, one_number
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.make import make_drawn_env, make_env
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.evaluate.play import Progress, play
+from sauna.experiments.evaluate.play import Progress
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import choose_renderer, frames_per_second, not_drawn
 from sauna.system.errors import BadInput, SaunaError

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from sauna.algorithm.rollout.play import play
 from sauna.envs.make import make_drawn_env, make_env
-from sauna.experiments.evaluate.artifact import Artifact, load_artifact
-from sauna.experiments.evaluate.play import play
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import choose_renderer, not_drawn
 from sauna.experiments.measure.streams import MemberSnapshot
+from sauna.training.artifact import Artifact, load_artifact
 
 EPISODES = 5
 SEED = 0  # of the first episode: the same ones for every member

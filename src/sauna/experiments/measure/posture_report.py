@@ -123,7 +123,7 @@ def shown(estimate: Estimate) -> str:
 
 def _compared(pair: Pair) -> str:
     if pair.p >= ALPHA:
-        kind = "no evidence of a difference"
+        kind = "not decided"
     else:
         kind = f"{'more' if pair.gained > pair.lost else 'fewer'} seeds on their feet"
     return (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -11,21 +13,23 @@ import numpy as np
 from sauna.experiments.report import style
 from sauna.experiments.report.sources import Source, read_sources
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, one_line
 
 TRAINING_RETURN = "training return\n(last 100 episodes)"
+EVALUATED = "return: training (last 100 episodes),\nevaluations (dotted)"
+DOTTED = (1.0, 1.5)  # points on and off
 GRID = 100  # points at which members' curves are compared
 
 
 def member_curves(
-    rows: list[dict[str, Any]],
+    rows: list[dict[str, Any]], key: str = "return_mean"
 ) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Returns `arm -> member -> (env steps, mean return of the last 100 episodes)`."""
+    """Returns `arm -> member -> (env steps, value of key)`; usually the training return."""
     points: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for row in rows:
-        if "return_mean" in row:
+        if key in row:
             of_arm = points.setdefault(row["arm"], {})
-            of_arm.setdefault(row["member"], []).append((row["env_steps"], row["return_mean"]))
+            of_arm.setdefault(row["member"], []).append((row["env_steps"], row[key]))
     return {
         arm: {
             name: (np.array([x for x, _ in line]), np.array([y for _, y in line]))
@@ -45,14 +49,28 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_curve(run: Path) -> Path | None:
-    """Draws `figures/learning_curve.png` of a run; None if no episode has finished."""
-    curves = member_curves(run_directory.rows(run))
+    """Draws `figures/learning_curve.png` of a run that was trained; None if that is not possible.
+
+    What keeps it from being drawn costs nothing else: the training has ended well.
+    """
+    try:
+        return _draw_run(run)
+    except Exception as error:  # of a disk that is full, or of Matplotlib
+        print(f"warning: no learning curve was drawn: {one_line(error)}", file=sys.stderr)
+        return None
+
+
+def _draw_run(run: Path) -> Path | None:
+    """Draws the curve of a run; None if no episode has finished."""
+    rows = run_directory.rows(run)
+    curves, evaluations = member_curves(rows), member_curves(rows, "eval_return_mean")
     if not curves:
         return None
     config = run_directory.read_config(run, needed=("config",))["config"]
     title = f"{config['env']}, preset {config['preset']}"
     path = run / "figures" / "learning_curve.png"
-    return _draw(curves, {arm: arm for arm in curves}, title, TRAINING_RETURN, path)
+    y_label = EVALUATED if evaluations else TRAINING_RETURN
+    return _draw(curves, {arm: arm for arm in curves}, title, y_label, path, evaluations)
 
 
 def plot(paths: Sequence[Path], out: str = "", tag: str = "") -> Path:
@@ -67,6 +85,8 @@ def plot(paths: Sequence[Path], out: str = "", tag: str = "") -> Path:
     path = Path(out or "learning_curves.png")
     if not out and len(paths) == 1 and (paths[0] / "config.json").is_file():
         path = paths[0] / "figures" / "learning_curve.png"
+        if drawn := draw_curve(paths[0]):
+            return drawn
     if path.suffix not in (".png", ".svg"):
         raise BadInput(f"out: {path} must end in .png or .svg")
     return draw_sources(read_sources(paths, tag), path)
@@ -87,6 +107,7 @@ def _draw(
     title: str,
     y_label: str,
     path: Path,
+    evaluations: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]] = MappingProxyType({}),
 ) -> Path:
     from matplotlib.figure import Figure
 
@@ -96,7 +117,11 @@ def _draw(
         axes = figure.subplots()
         for label, members in curves.items():
             _draw_arm(axes, label, members, looks[label])
-        style.fit_axes(axes, [y for members in curves.values() for _, y in members.values()])
+        for label, members in evaluations.items():
+            look = looks[label]._replace(dash=DOTTED)
+            _draw_arm(axes, f"{label}, evaluations", members, look)
+        lines = [*curves.values(), *evaluations.values()]
+        style.fit_axes(axes, [y for members in lines for _, y in members.values()])
         axes.set_ylabel(y_label)
         axes.set_title(title)
         axes.legend()

@@ -104,8 +104,17 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
         "keep_rate",
         "keep_rate",
         "Keep rate",
-        "Share of the env steps that the update learned from; 1 where nothing is dropped.",
+        "Share of the env steps that entered the rollout; 1 if no filter drops any.",
         "kept",
+        (0.0, 1.0),
+    ),
+    (
+        "samples_used",
+        "sample_rate",
+        "Samples used",
+        "Share of the rollout's samples that the policy learned from in an epoch, if an arm has a "
+        "sampler.",
+        "used",
         (0.0, 1.0),
     ),
     (
@@ -120,8 +129,8 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
         "explained_variance",
         "explained_variance",
         "Explained variance",
-        "Share of the returns' variance that the value function explains, over the env steps that "
-        "the update learned from, which a filter chooses. The axis is cut at -1.",
+        "Share of the returns' variance that the value function explains, over the env steps of "
+        "the rollout, which a filter chooses. The axis is cut at -1.",
         "explained variance",
         (-1.0, 1.0),
     ),
@@ -190,12 +199,13 @@ def looks_of(results: Mapping[str, Any]) -> dict[str, style.Look]:
 def _curve_panels(
     results: Mapping[str, Any], summary: Mapping[str, Any], metric: str
 ) -> list[Panel]:
+    configs = {(cell["task"], cell["label"]): cell["config"] or {} for cell in results["cells"]}
     panels = []
     for task, of_label in summary["curves"].items():
         lines = []
         for label, curves in of_label.items():
             curve = curves.get(metric)
-            if curve and _any(curve["mean"]):
+            if curve and _any(curve["mean"]) and _means(metric, configs[task, label]):
                 seeds = _seeds(results, task, label, metric)
                 lines.append(
                     Line(
@@ -209,6 +219,15 @@ def _curve_panels(
                 )
         panels.append(Panel(task, lines))
     return panels
+
+
+def _means(metric: str, config: Mapping[str, Any]) -> bool:
+    """Whether a curve says something of an arm: of a head that is trained, of a sampler."""
+    if metric == "vex_mean":
+        return config.get("vex_coef", 1.0) != 0
+    if metric == "sample_rate":
+        return config.get("sampler", "none") != "none"
+    return True
 
 
 def _seeds(

@@ -28,6 +28,7 @@ from sauna.experiments.study.execute.local import LocalExecutor
 from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
+from sauna.experiments.study.own_arms import check_no_rule, control_of_any, with_own_arms
 from sauna.experiments.study.results import gather, typed
 from sauna.experiments.study.rounds import every_unit, first_look, next_round, round_units, stopped
 from sauna.experiments.study.spec import Spec, load_spec, read_spec, resolved
@@ -60,14 +61,17 @@ def chosen_arms(
       settings: of every run.
 
     Raises:
-      BadInput: both are given.
+      BadInput: both are given, or `settings` name a rule.
     """
     if rules and tuple(arms) != COMPARED:
         raise BadInput("rules: give --rules or --arms, not both")
     if tuple(arms) == ("all",):
         rules = tuple(RULE_HELP)
     chosen = ("ppo", *rules) if rules else tuple(arms)
-    return with_controls(chosen, settings) if controls else chosen, bool(rules)
+    check_no_rule(settings, chosen)
+    if controls:
+        chosen = with_controls(chosen, settings, control_of_any)
+    return chosen, bool(rules)
 
 
 def comparison(
@@ -77,7 +81,7 @@ def comparison(
 
     Args:
       env: the task.
-      arms: what is trained; the first is the baseline.
+      arms: what is trained, names or `module:name` of rules; the first is the baseline.
       settings: of every run.
       sequential: whether seeds are added only where something is open, `seeds` at most.
 
@@ -89,7 +93,8 @@ def comparison(
         rules = {"truncation": "terminate", "budget": "env"}
     algorithm = algorithm_of(chosen_preset({**settings, "env": env}))
     own = {"label": algorithm, "arm": "ppo"} if algorithm != "ppo" else {"label": "ppo"}
-    entries = [own if arm == "ppo" else {"label": arm} for arm in arms]
+    entries, settings = with_own_arms(arms, settings)
+    entries = [own if entry == {"label": "ppo"} else entry for entry in entries]
     seeds, design = COMPARED_SEEDS, {}
     if sequential:
         seeds, design = DESIGN[-1].seeds, {"design": "sequential"}
@@ -115,9 +120,9 @@ def compare_command(
     return f"sauna compare {shlex.quote(env)} {chosen}{flags}{_typed_out(out)}"
 
 
-def study_command(name: str, out: str | Path) -> str:
-    """Returns what a user types to run the study again."""
-    return f"sauna study {shlex.quote(name)}{_typed_out(out)}"
+def study_command(name: str, out: str | Path, names_code: bool = False) -> str:
+    """Returns what a user types to run the study again; another one has to trust its code."""
+    return f"sauna study {shlex.quote(name)}{_typed_out(out)}" + " --trust" * names_code
 
 
 def _typed_out(out: str | Path) -> str:
@@ -224,7 +229,7 @@ def _train(
         _note(spec, place, size)
         say = _silent if quiet else partial(print, flush=True)
         units = every_unit(spec, size)
-        check_same_code(units, folder, accept_changed_code)
+        check_same_code(units, folder, accept_changed_code, say)
         reopen_damaged(units, folder, say)
         say(_opening(spec, place))
         for note in before_training(spec):

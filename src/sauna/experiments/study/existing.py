@@ -69,7 +69,16 @@ def compare_existing(
     run_directory.write_json(place / "results.json", results)
     run_directory.write_json(place / "summary.json", summary)
     report = write_report(results, summary, place)
-    return [ends_of(sources), "", *lines(summary), "", f"report: {report}"]
+    about = (
+        f"final return here: {final_of(sources)}; `sauna compare ENV` takes the last 100 episodes"
+    )
+    return [ends_of(sources), about, "", *lines(summary), "", f"report: {report}"]
+
+
+def final_of(sources: Sequence[Source]) -> str:
+    """Says what the final return of runs that exist is."""
+    end = min(curve.x[-1] for source in sources for curve in source.seeds.values())
+    return f"mean of the returns from {short((1 - LAST) * end)} to {short(end)} env steps"
 
 
 def ends_of(sources: Sequence[Source]) -> str:
@@ -91,10 +100,7 @@ def results_of(sources: Sequence[Source], command: str) -> dict[str, Any]:
     start, end = max(c.x[0] for c in curves), min(c.x[-1] for c in curves)
     if start >= end:
         raise BadInput("the curves have no env steps in common, so nothing can be compared")
-    metric = (
-        f"mean of the returns from {short((1 - LAST) * end)} to {short(end)} env steps, "
-        f"which every seed reaches ({ends_of(sources)})"
-    )
+    metric = f"{final_of(sources)}, which every seed reaches ({ends_of(sources)})"
     return {
         "format": FORMAT,
         "name": "runs that exist",

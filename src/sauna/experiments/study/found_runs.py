@@ -1,19 +1,23 @@
-"""The runs that a study finds: of the code that it names today, and with all their rows."""
+"""The runs that a study finds: of today's code, and with all their rows."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 from sauna.config.code import changed_code, code_of
+from sauna.config.own_sources import newer_sources
 from sauna.experiments.study.units import Unit, parts
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import damage_of
 
 
-def check_same_code(units: list[Unit], folder: Path, accept: bool) -> None:
-    """Refuses to take results of other code for those of today's.
+def check_same_code(
+    units: list[Unit], folder: Path, accept: bool, say: Callable[[str], None]
+) -> None:
+    """Refuses to take results of other code for those of today's; a newer version is said.
 
     Args:
       accept: the user has said that they count as today's; the runs note both.
@@ -21,6 +25,7 @@ def check_same_code(units: list[Unit], folder: Path, accept: bool) -> None:
     Raises:
       BadInput: naming what changed.
     """
+    newer: Counter[str] = Counter()
     for unit in (part for whole in units for part in parts(whole, folder)):
         run = unit.run(folder)
         if not (run / "config.json").is_file():
@@ -35,6 +40,10 @@ def check_same_code(units: list[Unit], folder: Path, accept: bool) -> None:
             )
         if changed:
             run_directory.write_config(run, run_directory.with_code(stored, now))
+        elif text := newer_sources(stored.get("code", {}), now):
+            newer[text] += 1
+    for text, number in newer.items():
+        say(f"note: reused: {number} runs of {text}; another --out trains them anew")
 
 
 def reopen_damaged(units: list[Unit], folder: Path, say: Callable[[str], None]) -> None:

@@ -5,39 +5,41 @@ from __future__ import annotations
 import numpy as np
 
 from sauna.config.parsing import many_seeds
-from sauna.config.zoo import entry_for
+from sauna.config.settings import to_json
 from sauna.experiments.statistics import compare
-from sauna.experiments.study.spec import Arm, Spec
+from sauna.experiments.study.cells import Cell
+from sauna.experiments.study.spec import Arm, Spec, check
+from sauna.experiments.study.verdicts import families_of, least_of
 
 
 def before_training(spec: Spec) -> list[str]:
-    """Says which presets are picked, and if there are too few seeds, or surprisingly many."""
+    """Says if a study has too few seeds to find any difference, or surprisingly many."""
     notes = [note for arm in spec.arms if (note := many_seeds(arm.seeds))]
-    notes += [note for arm in spec.arms for note in _picked(arm)]
     for task in spec.tasks:
-        arms = {arm.label: arm for arm in spec.arms if task in arm.tasks}
-        for baseline in dict.fromkeys(arm.baseline for arm in arms.values() if arm.baseline):
-            family = [arm for arm in arms.values() if arm.baseline == baseline]
-            notes += _underpowered(task, arms[baseline], family)
+        notes += _too_few(task, {arm.label: arm for arm in spec.arms if task in arm.tasks})
     return list(dict.fromkeys(notes))
 
 
-def _picked(arm: Arm) -> list[str]:
-    """Says which presets `auto` stands for in an arm."""
-    picked = {task: entry_for({**arm.settings, "env": task}) for task in arm.tasks}
-    named = "steps" in arm.settings
-    return [entry.said(task, named) for task, entry in picked.items() if entry]
-
-
-def _underpowered(task: str, baseline: Arm, family: list[Arm]) -> list[str]:
-    """Tries the test with every score of an arm above every score of its baseline."""
-    low = np.arange(len(baseline.seeds), dtype=float)
-    found = compare({arm.label: (low[-1] + 1.0 + np.arange(len(arm.seeds)), low) for arm in family})
-    short = {label: result for label, result in found.items() if result.kind == "underpowered"}
-    if not short:
-        return []
-    needed = max(result.least for result in short.values())
+def _too_few(task: str, arms: dict[str, Arm]) -> list[str]:
+    """Tries the tests with every score of an arm above every score of its baseline."""
+    cells = [_cell(arm, task) for arm in arms.values()]
+    short: dict[str, list[str]] = {}
+    for family in families_of(cells):
+        baseline = str(family[0].baseline)
+        low = np.arange(len(arms[baseline].seeds), dtype=float)
+        above = {c.label: low[-1] + 1.0 + np.arange(len(arms[c.label].seeds)) for c in family}
+        found = compare({label: (scores, low) for label, scores in above.items()})
+        few = [label for label, result in found.items() if result.kind == "underpowered"]
+        short[baseline] = short.get(baseline, []) + few
     return [
-        f"note: underpowered: so few seeds cannot show a difference between {baseline.label} and "
-        f"{', '.join(short)} on {task}, whatever they are; give at least --seeds {needed}"
+        f"note: too few seeds: so few cannot show a difference between {baseline} and "
+        f"{', '.join(labels)} on {task}, whatever they are; give at least --seeds {least_of(cells)}"
+        for baseline, labels in short.items()
+        if labels
     ]
+
+
+def _cell(arm: Arm, task: str) -> Cell:
+    """An arm of which nothing is trained yet."""
+    config = to_json(check(arm, task))
+    return Cell(task, arm.label, arm.arm, arm.baseline, [], 0, 0, 0, None, config)

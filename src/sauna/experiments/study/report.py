@@ -25,7 +25,6 @@ from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
-from sauna.experiments.study.summary import ABLATION
 from sauna.system.safe_write import replace_file
 from sauna.training.display import counted
 
@@ -41,10 +40,16 @@ MARKS = {
 ANSWERS = {
     "better": "better",
     "worse": "worse",
-    "no evidence": "no evidence of a difference",
+    "no evidence": "not decided",
     "underpowered": "too few seeds to decide",
     "too many failed": "too many seeds failed to decide",
     "open": "still open",
+}
+# How a kind of verdict is called: the words of docs/concepts/statistics.md.
+WORDS = {
+    **{kind: kind for kind in MARKS},
+    "no evidence": "not decided",
+    "underpowered": "too few seeds",
 }
 UNFOLDED = 5  # verdicts that are shown with all their words
 
@@ -86,16 +91,17 @@ def make_page(
         unfinished=_counts(results)["running"] + _counts(results)["waiting"],
         section=section,
         summary=summary,
-        ablation=ABLATION,
+        ablation=summary.get("about_filtering", ""),
         ranking=tables.ranking(summary),
         ranking_about=RANKING,
         equal_compute_about=EQUAL_COMPUTE,
         by_compute=[(plot, _panels(plot, looks)) for plot in compute_plots(summary)],
         marks=MARKS,
+        words=WORDS,
         unfolded=UNFOLDED,
         totals=totals,
         pairs=pairs,
-        columns=tables.main_columns(results["baseline"]),
+        columns=tables.main_columns(results["baseline"], tables.has_samplers(summary["table"])),
         groups=tables.main_groups(summary, looks),
         metric=results["metric"],
         baseline=results["baseline"],
@@ -177,8 +183,8 @@ def _counts(results: Mapping[str, Any]) -> Counter[str]:
 
 
 def totals(found: Sequence[Mapping[str, Any]]) -> str:
-    """Returns `2 better, 3 no evidence`."""
-    counts = Counter(verdict["kind"] for verdict in found)
+    """Returns `2 better, 3 not decided`."""
+    counts = Counter(WORDS[verdict["kind"]] for verdict in found)
     return ", ".join(f"{count} {kind}" for kind, count in counts.items())
 
 

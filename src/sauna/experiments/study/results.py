@@ -24,6 +24,7 @@ METRIC = "mean training return (sampled actions) of the last 100 episodes"
 CURVES = (
     "return_mean",
     "keep_rate",
+    "sample_rate",
     "vex_mean",
     "vex_spread",
     "vex_median",
@@ -105,37 +106,53 @@ def _members(unit: Unit, folder: Path, budget: int) -> list[dict[str, Any]]:
             rows[row["seed"]].append(row)
         timings = run_directory.rows(part.run(folder), "timing.jsonl")
         for seed in part.seeds:
-            error = part.error(folder)
+            error, stopped = part.error(folder), _stopped_early(part.run(folder), seed)
             status = "running" if rows[seed] else "waiting"
             if part.is_complete(folder):
                 status = "complete"
             elif error is not None:
                 status = "failed"
-            ended = _ended(rows[seed], budget, timings)
-            found.append({"seed": seed, "status": status, "error": error, **ended})
+            ended = _ended(rows[seed], budget, timings, stopped is not None)
+            member = {"seed": seed, "status": status, "error": error, **ended}
+            found.append(member | ({"stopped_early": stopped} if stopped else {}))
     return found
 
 
+def _stopped_early(run: Path, seed: int) -> str | None:
+    """Says what stopped a member before the end of its budget; None: nothing did."""
+    path = run / "summary.json"
+    if not path.is_file():
+        return None
+    members = run_directory.read_config_file(path).get("members", {}).values()
+    return next((m.get("stopped_early") for m in members if m.get("seed") == seed), None)
+
+
 def _ended(
-    rows: list[dict[str, Any]], budget: int, timings: Sequence[dict[str, Any]] = ()
+    rows: list[dict[str, Any]],
+    budget: int,
+    timings: Sequence[dict[str, Any]] = (),
+    stopped_early: bool = False,
 ) -> dict[str, Any]:
     """A member's last numbers and its thinned curve.
 
     The AUC is that of the first `budget` env steps, also if kept steps are counted and a member
-    takes more env steps.
+    takes more env steps. A member that was stopped early keeps its last return up to there.
     """
-    last = rows[-1] if rows else {}
+    last, compute = rows[-1] if rows else {}, _compute(rows, timings)
+    if stopped_early and last and last["env_steps"] < budget:
+        rows = [*rows, {"env_steps": budget, "return_mean": last.get("return_mean")}]
+        compute = {name: [*values, values[-1]] for name, values in compute.items()}
     steps = np.array([row["env_steps"] for row in rows], float)
-    returns = np.array([row.get("return_mean", np.nan) for row in rows], float)
+    returns = np.array([row.get("return_mean") for row in rows], float)
     within = steps <= budget
     kept, tried = last.get("kept_steps"), last.get("env_steps")
-    compute = _compute(rows, timings)
     return {
         "final_return": last.get("return_mean"),
         "auc": area_under_curve(steps[within], returns[within]),
         "env_steps": tried,
         "kept_steps": kept,
         "keep_rate": kept / tried if kept is not None and tried else None,
+        "sample_rate": _short(_mean([row["sample_rate"] for row in rows if "sample_rate" in row])),
         "episodes": last.get("episodes"),
         "explained_variance": last.get("explained_variance"),
         **{name: _short(values[-1]) for name, values in compute.items()},
@@ -155,6 +172,10 @@ def _compute(
         "learner_cpu_seconds": cumulated([seconds.get(row.get("iteration", -1)) for row in rows]),
     }
     return {name: values for name, values in found.items() if values[0] is not None}
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 def _short(value: float | None) -> float | None:

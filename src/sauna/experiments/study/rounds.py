@@ -1,4 +1,4 @@
-"""A sequential study: which seeds are trained next, read off the runs that are there.
+"""A sequential study: which seeds are trained next, read off the runs so far.
 
 Nothing is stored beside the runs. A study that is run again finds the same looks and goes on.
 """

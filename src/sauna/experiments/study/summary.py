@@ -24,19 +24,22 @@ from sauna.experiments.statistics import (
     performance_profile,
 )
 from sauna.experiments.study import ranking
-from sauna.experiments.study.cells import Cell, is_control_among
+from sauna.experiments.study.cells import Cell
 from sauna.experiments.study.equal_compute import by_compute, compute_verdicts
 from sauna.experiments.study.verdicts import (
     ABLATION,
+    CONTROL,
     MORE_STEPS,
     UNFILTERED,
     ablations_of,
+    about_ablations,
+    families_of,
     is_random_control,
     verdicts_of,
 )
 from sauna.system.errors import BadInput
 
-__all__ = ["ABLATION", "MORE_STEPS", "UNFILTERED", "random_controls", "summarize"]
+__all__ = ["MORE_STEPS", "UNFILTERED", "random_controls", "summarize"]
 
 FORMAT = 1
 GRID = 60  # points of a curve at most
@@ -44,6 +47,7 @@ GRID = 60  # points of a curve at most
 QUANTITIES = {
     "return_mean": (-math.inf, math.inf),
     "keep_rate": (0.0, 1.0),
+    "sample_rate": (0.0, 1.0),
     "vex_mean": (-math.inf, math.inf),
     "explained_variance": (-math.inf, 1.0),
 }
@@ -72,6 +76,9 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
             for verdict in verdicts_of(of_task[task], of_label, len(of_task))
         ],
         "filtering": [v for own in of_task.values() for v in ablations_of(own, len(of_task))],
+        "about_filtering": max(
+            (about_ablations(own) for own in of_task.values()), key=len, default=""
+        ),
         "table": [_row(cell, found[cell.task].get(cell.label)) for cell in cells],
         "over_tasks": _over_tasks(of_task),
         "profiles": {task: _profiles(of_task[task]) for task in of_task},
@@ -86,6 +93,7 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
             "table": _as_ranked(summary["table"], rows),
             "verdicts": ranking.verdicts(rows),
             "filtering": ranking.control_verdicts(rows),
+            "about_filtering": f"{ABLATION}{CONTROL}.",
         }
     return summary
 
@@ -138,21 +146,18 @@ def _cell(stored: Mapping[str, Any], baseline: str) -> Cell:
 
 
 def _compare(cells: Sequence[Cell]) -> dict[str, Comparison]:
-    """Each arm against its baseline; the arms of one baseline are one family of tests."""
+    """Each arm against its baseline, family by family."""
     scores = {cell.label: cell.scores() for cell in cells}
     found: dict[str, Comparison] = {}
-    for baseline in dict.fromkeys(cell.baseline for cell in cells if cell.baseline):
-        base = scores.get(baseline, np.zeros(0))
-        family = [cell for cell in cells if cell.baseline == baseline]
-        # Controls are a family of their own: they take nothing from the rules' tests.
-        for is_control in (False, True):
-            asked = [c.label for c in family if is_control_among(c, cells) == is_control]
-            found |= compare({label: (scores[label], base) for label in asked})
+    for family in families_of(cells):
+        base = scores.get(str(family[0].baseline), np.zeros(0))
+        found |= compare({cell.label: (scores[cell.label], base) for cell in family})
     return {cell.label: found[cell.label] for cell in cells if cell.baseline}
 
 
 def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
     final = cell.values("final_return")
+    stopped = sum("stopped_early" in member for member in cell.complete)
     return {
         "task": cell.task,
         "label": cell.label,
@@ -165,10 +170,13 @@ def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
         "final_mean": cell.mean("final_return"),
         "final_std": float(final.std(ddof=1)) if len(final) > 1 else None,
         "keep_rate": cell.mean("keep_rate"),
+        "sampler": cell.config.get("sampler", "none"),
+        "sample_rate": cell.mean("sample_rate"),
         "env_steps": cell.mean("env_steps"),
         "kept_steps": cell.mean("kept_steps"),
         "samples_backward": cell.mean("samples_backward"),
         "improvement": list(comparison.improvement) if comparison else None,
+        **({"stopped_early": stopped} if stopped else {}),
     }
 
 

@@ -10,6 +10,7 @@ from sauna.experiments.report.numbers import digits_of, digits_of_tasks
 from sauna.experiments.report.page import MINUS
 from sauna.experiments.report.style import Look
 
+PAPER_STEPS = 1_000_000  # env steps of each of its trainings
 # Table 1 of the SAUNA paper, as printed.
 PAPER: dict[str, dict[str, tuple[float, float]]] = {
     "HalfCheetah": {"PPO": (2277, 432), "SAUNA": (2929, 169)},
@@ -23,6 +24,7 @@ SEED_COLUMNS = {
     "final_return": "Final return",
     "auc": "AUC",
     "keep_rate": "Keep rate",
+    "sample_rate": "Samples used",
     "explained_variance": "Explained variance",
     "env_steps": "Env steps",
     "kept_steps": "Kept steps",
@@ -33,17 +35,25 @@ SEED_COLUMNS = {
 FORMER_KEYS = {"auc": "area"}  # in results of 0.1.0
 
 
-def main_columns(baseline: str) -> tuple[str, ...]:
-    return (
-        "Arm",
-        "Final return, IQM",
-        f"Better than {baseline}",
-        "AUC, IQM",
-        "Final return, mean ± std",
-        "Keep rate",
-        "Env steps",
-        "Seeds",
-    )
+def has_samplers(table: Sequence[Mapping[str, Any]]) -> bool:
+    """Returns whether an arm has a sampler, so that the share of samples it uses is shown."""
+    return any(row.get("sampler", "none") != "none" for row in table)
+
+
+def main_columns(baseline: str, sampled: bool) -> dict[str, str]:
+    """Returns the columns of the main table, `sampled` with the share of samples used."""
+    columns = {
+        "arm": "Arm",
+        "final_iqm": "Final return, IQM",
+        "improvement": f"Better than {baseline}",
+        "auc_iqm": "AUC, IQM",
+        "final_mean": "Final return, mean ± std",
+        "keep_rate": "Keep rate",
+        "sample_rate": "Samples used",
+        "env_steps": "Env steps",
+        "seeds": "Seeds",
+    }
+    return {name: text for name, text in columns.items() if sampled or name != "sample_rate"}
 
 
 def main_groups(summary: Mapping[str, Any], looks: Mapping[str, Look]) -> list[dict[str, Any]]:
@@ -73,13 +83,14 @@ def ranking(summary: Mapping[str, Any]) -> list[tuple[str, list[dict[str, Any]]]
 
 
 def paper(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Returns the paper's numbers beside those of our PPO, for the tasks that it has; None for
-    others."""
-    is_ppo = {
+    """Returns the paper's numbers beside those of our PPO, for the tasks that it has and as many
+    env steps; None for others."""
+    alike = {
         (cell["task"], cell["label"]): cell["config"].get("algorithm", "ppo") == "ppo"
+        and cell["config"].get("steps", PAPER_STEPS) == PAPER_STEPS
         for cell in results["cells"]
     }
-    ours = {key: row for row in summary["table"] if is_ppo[key := (row["task"], row["label"])]}
+    ours = {key: row for row in summary["table"] if alike[key := (row["task"], row["label"])]}
     tasks = [task for task in dict.fromkeys(task for task, _ in ours) if unversioned(task) in PAPER]
     if not tasks:
         return None

@@ -8,11 +8,12 @@ from typing import Any
 from sauna.experiments.report.numbers import aligned, digits_of_tasks, interval, number
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
-from sauna.experiments.study.verdicts import ABLATION
+from sauna.experiments.study.tables import has_samplers
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
     """Returns the table and the verdicts, as text."""
+    sampled = has_samplers(summary["table"])
     head = [
         "task",
         "arm",
@@ -21,16 +22,17 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
         "AUC, IQM",
         "mean +- std",
         "keep rate",
+        *(["samples used"] if sampled else []),
         "env steps",
         "P(improvement)",
     ]
     digits = digits_of_tasks(summary["table"])
-    rows = [head, *(_row(row, digits[row["task"]]) for row in summary["table"])]
+    rows = [head, *(_row(row, digits[row["task"]], sampled) for row in summary["table"])]
     said = [v["text"] for v in summary["verdicts"]]
     if "ranking" in summary:
         said = [*ranking_lines(summary["ranking"]), "", RANKING]
     if summary["filtering"]:
-        ablation = "Ablation of the selection rule. " + ABLATION
+        ablation = "Ablation of the selection rule. " + summary["about_filtering"]
         said += ["", ablation, *(v["text"] for v in summary["filtering"])]
     if equal := summary.get("equal_compute"):
         said += ["", "At equal compute. " + EQUAL_COMPUTE, *(v["text"] for v in equal)]
@@ -59,17 +61,19 @@ def ranking_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return aligned(texts)
 
 
-def _row(row: Mapping[str, Any], digits: int) -> list[str]:
+def _row(row: Mapping[str, Any], digits: int, sampled: bool) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
+    stopped = f" ({row['stopped_early']} stopped early)" if row.get("stopped_early") else ""
     mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
     return [
         row["task"],
         row["label"],
-        f"{row['seeds']}{failed}",
+        f"{row['seeds']}{failed}{stopped}",
         interval(row["final_iqm"], digits),
         interval(row["auc_iqm"], digits),
         f"{mean} +- {std}",
         number(row["keep_rate"], 3),
+        *([number(row["sample_rate"], 3)] if sampled else []),
         number(row["env_steps"], 0),
         interval(row["improvement"], 2),
     ]

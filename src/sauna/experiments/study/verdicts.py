@@ -9,7 +9,7 @@ from typing import Any
 
 from sauna.config.presets import RANDOM_CONTROL, arm_settings
 from sauna.config.settings import Config
-from sauna.experiments.statistics import ALPHA, POWER, Comparison, compare
+from sauna.experiments.statistics import ALPHA, POWER, Comparison, compare, least_seeds
 from sauna.experiments.study.cells import MAX_FAILED, Cell, is_control_among
 from sauna.system.errors import BadInput
 
@@ -20,6 +20,7 @@ FILTERS_OWN = (
     "out",
     "processes",
     "filter",
+    "filter_kwargs",
     "control",
     "threshold",
     "threshold_schedule",
@@ -35,11 +36,9 @@ FILTERS_OWN = (
 CONTROLS_OWN = ("arm", "seeds", "out", "processes", "control")
 UNFILTERED = 0.99  # mean keep rate from which a difference is not credited to filtering
 MORE_STEPS = 0.01  # relative difference in env steps from which it is mentioned
-ABLATION = (
-    "Each arm that selects steps against those that differ from it in the selection rule alone: "
-    "the head-only ablation, which trains the head and drops nothing, and the matched random "
-    "control, which drops as many steps at random."
-)
+ABLATION = "Each arm that selects samples against those that differ from it in the rule alone: "
+HEAD_ONLY = "the head-only ablation, which trains the head and drops nothing"
+CONTROL = "the matched random control, which takes as many samples at random"
 MANY_SEEDS = 1000  # no estimate of a number of seeds is worth more digits
 
 
@@ -53,17 +52,15 @@ def verdicts_of(
       tasks: how many the study has.
     """
     of_label = {cell.label: cell for cell in cells}
+    families, least = families_of(cells), least_of(cells)
     verdicts = []
     for label, comparison in found.items():
         cell = of_label[label]
         absent = Cell(cell.task, str(cell.baseline), "", None, [], 0, 0, 0)
         base = of_label.get(str(cell.baseline), absent)
-        is_control = is_control_among(cell, cells)
-        family = sum(
-            other.baseline == cell.baseline and is_control_among(other, cells) == is_control
-            for other in cells
-        )
-        verdicts.append(_verdict(cell, base, comparison, _family(family, "arms"), tasks))
+        number = next(len(family) for family in families if cell in family)
+        comparison = comparison._replace(least=least)
+        verdicts.append(_verdict(cell, base, comparison, _family(number, "arms"), tasks))
     return verdicts
 
 
@@ -74,22 +71,51 @@ def ablations_of(cells: Sequence[Cell], tasks: int) -> list[dict[str, Any]]:
     says what head, selection and fewer updates do together; these say what the selection rule does.
     All of a task are one family of tests.
     """
-    pairs = {
-        f"{cell.label} - {other.label}": (cell, other)
-        for cell in cells
-        for other in cells
-        if is_random_control(other, cell)
-        or (
-            _settings(cell.arm).get("filter") == "sauna"
-            and not _is_controlled(cell)
-            and _is_head_alone(other, cell)
-        )
-    }
+    pairs = _ablations(cells)
     found = compare(
         {name: (cell.scores(), other.scores()) for name, (cell, other) in pairs.items()}
     )
-    family = _family(len(pairs), "comparisons")
-    return [_verdict(*pairs[name], comparison, family, tasks) for name, comparison in found.items()]
+    family, least = _family(len(pairs), "comparisons"), least_of(cells)
+    return [
+        _verdict(*pairs[name], comparison._replace(least=least), family, tasks)
+        for name, comparison in found.items()
+    ]
+
+
+def _ablations(cells: Sequence[Cell]) -> dict[str, tuple[Cell, Cell]]:
+    return {
+        f"{cell.label} - {other.label}": (cell, other)
+        for cell in cells
+        for other in cells
+        if is_random_control(other, cell) or _is_head_of(other, cell)
+    }
+
+
+def about_ablations(cells: Sequence[Cell]) -> str:
+    """Says which ablations the arms of a study have; empty if there is none."""
+    pairs = _ablations(cells).values()
+    heads = [HEAD_ONLY] if any(_is_head_of(other, cell) for cell, other in pairs) else []
+    controls = [CONTROL] if any(is_random_control(other, cell) for cell, other in pairs) else []
+    return f"{ABLATION}{', and '.join(heads + controls)}." if pairs else ""
+
+
+def families_of(cells: Sequence[Cell]) -> list[list[Cell]]:
+    """Returns the arms of a task whose tests are corrected together.
+
+    Controls are a family of their own: they take nothing from the rules' tests.
+    """
+    found = [
+        [c for c in cells if c.baseline == baseline and is_control_among(c, cells) == is_control]
+        for baseline in dict.fromkeys(cell.baseline for cell in cells if cell.baseline)
+        for is_control in (False, True)
+    ]
+    return [family for family in found if family]
+
+
+def least_of(cells: Sequence[Cell]) -> int:
+    """Returns the seeds of each arm below which some comparison of a task can decide nothing."""
+    numbers = [*map(len, families_of(cells)), len(_ablations(cells))]
+    return max((least_seeds(number) for number in numbers if number), default=2)
 
 
 def is_random_control(other: Cell, cell: Cell) -> bool:
@@ -121,6 +147,12 @@ def _is_controlled(cell: Cell) -> bool:
     """Whether a control replaces what the arm's rule takes."""
     control = cell.config.get("control") or _settings(cell.arm).get("control", "none")
     return bool(control != "none")
+
+
+def _is_head_of(other: Cell, cell: Cell) -> bool:
+    """Whether `other` is the head-only ablation of `cell`, whose own filter drops."""
+    filters = _settings(cell.arm).get("filter") == "sauna"
+    return filters and not _is_controlled(cell) and _is_head_alone(other, cell)
 
 
 def _is_head_alone(other: Cell, cell: Cell) -> bool:
@@ -177,10 +209,10 @@ def _finding(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str
     kind, (chance, low, high) = comparison.kind, comparison.improvement
     n, m = (len(c.scores()) for c in (cell, base))
     if kind == "underpowered" or chance is None or low is None or high is None:
-        return _underpowered(cell, base, comparison, family)
+        return _underpowered(cell, base, comparison)
     if kind == "too many failed":
         return _no_verdict(cell, base)
-    said = f"{kind} than" if kind != "no evidence" else "no evidence of a difference from"
+    said = f"{kind} than" if kind != "no evidence" else "not decided against"
     correction = f" after Holm's correction for {family}" if family else ""
     shown = [_shown(x, 2, 0.5) for x in (chance, low, high)]
     p = "< 0.001" if comparison.p < 0.001 else f"= {_shown(comparison.p, 3, ALPHA)}"
@@ -202,20 +234,12 @@ def _no_verdict(cell: Cell, base: Cell) -> str:
     )
 
 
-def _underpowered(cell: Cell, base: Cell, comparison: Comparison, family: str) -> str:
+def _underpowered(cell: Cell, base: Cell, comparison: Comparison) -> str:
     n, m = (len(c.scores()) for c in (cell, base))
-    text = (
-        f"{cell.label}: too few seeds to say anything against {base.label} on {cell.task}: "
-        f"{n} against {m} ended; at least {comparison.least} of each are needed"
+    return (
+        f"{cell.label}: too few seeds to decide against {base.label} on {cell.task}: {n} and {m} "
+        f"seeds have ended; at least {comparison.least} of each are needed."
     )
-    if family:
-        text += f" for {family}"
-    if comparison.needed is not None:
-        text += (
-            f", and {_about(comparison.needed)} for a difference as large as the one seen, "
-            f"were it the true one ({POWER:.0%} power)"
-        )
-    return text + "."
 
 
 def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[str]:
@@ -233,7 +257,7 @@ def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[
         if comparison.needed is not None and comparison.needed > min(n, m):
             said.append(
                 f"Were the difference seen the true one, {_about(comparison.needed)} seeds of "
-                f"each would be needed to find it ({POWER:.0%} power)."
+                f"each would be needed to find it ({POWER:.0%} power; a rough order of magnitude)."
             )
         return said
     said = [f"This is not corrected for the {tasks} tasks."] if tasks > 1 else []

@@ -15,7 +15,12 @@ from sauna.training.loop.member_state import Counters
 
 
 def budget_left(config: Config, counters: Counters) -> bool:
-    """Returns whether a whole rollout still fits in the budget: a run never oversteps it."""
+    """Returns whether a whole rollout still fits in the budget: a run never oversteps it.
+
+    A member that was stopped early has none left.
+    """
+    if counters.stopped:
+        return False
     used = counters.kept_steps if config.budget == "kept" else counters.env_steps
     return config.steps - used >= config.rollout_steps * config.envs
 
@@ -32,12 +37,23 @@ def step_limit(config: Config, counters: Counters) -> int:
 def hypers_now(member_config: Config, counters: Counters) -> Hypers:
     """Computes the traced hyperparameters of a member, of whose budget `counters` are used."""
     used = counters.kept_steps if member_config.budget == "kept" else counters.env_steps
-    left = 1.0 - used / member_config.steps
+    left = share_left(member_config, used)
     values = {name: getattr(member_config, name) for name in Hypers._fields}
     values["threshold"] = scheduled(member_config.threshold, member_config.threshold_schedule, left)
     if member_config.learning_rate_schedule == "linear":
         values["learning_rate"] = member_config.learning_rate * left
     return Hypers(**{name: np.float32(value) for name, value in values.items()})  # type: ignore[arg-type]
+
+
+def share_left(config: Config, used: int) -> float:
+    """Computes the share of the schedules that is left when `used` steps of the budget are used.
+
+    It is 1 up to `schedule_start` and falls to 0 at the end of the budget.
+    """
+    if not config.schedule_start:
+        return 1.0 - used / config.steps
+    first = config.schedule_start
+    return min(1.0, 1.0 - (used - first) / (config.steps - first))
 
 
 def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
@@ -49,8 +65,17 @@ def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
 
 def device_hypers(config: Config, setting: Setting, used: Array) -> Hypers:
     """Computes a member's hyperparameters from `setting`, when `used` steps of its budget are."""
-    left, rate = 1.0 - used.astype(jnp.float32) / setting.steps, setting.hypers.learning_rate
+    left, rate = _device_share_left(config, setting, used), setting.hypers.learning_rate
     return setting.hypers._replace(
         learning_rate=rate * left if config.learning_rate_schedule == "linear" else rate,
         threshold=scheduled(setting.hypers.threshold, config.threshold_schedule, left),
     )
+
+
+def _device_share_left(config: Config, setting: Setting, used: Array) -> Array:
+    """The device's twin of `share_left`."""
+    if not config.schedule_start:
+        return 1.0 - used.astype(jnp.float32) / setting.steps
+    first = config.schedule_start
+    after = (used - first).astype(jnp.float32) / (setting.steps - first)
+    return jnp.minimum(1.0, 1.0 - after)

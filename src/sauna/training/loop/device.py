@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -34,8 +35,14 @@ from sauna.training.loop.device_program import (
     MemberState,
     Population,
     Report,
-    is_sound,
+    is_finite,
     make_mesh,
+)
+from sauna.training.loop.evaluation import DevicePlayer, Evaluator, Frozen, stop_named
+from sauna.training.loop.fine_tuning import (
+    as_long_moments,
+    initial_moments,
+    initial_params,
 )
 from sauna.training.loop.job import Job, Reporter, Setting, check_finite
 from sauna.training.loop.member_state import (
@@ -87,21 +94,40 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
     restored = broadcast_arrays(host, dict(job.restored or {}))
     if restored:
         counters = _restore(job, population, restored)
+    elif job.initial:
+        _initialise(job, population, job.initial)
+    evaluator = make_evaluator(job, population)
     reporter.phase("compiling")
     reporter.phase(f"compiled in {population.compile():.1f} s")
     iteration = broadcast(host, job.start)
     while any(budget_left(config, c) for c in counters):
         due = config.checkpoint_every - iteration % config.checkpoint_every
+        due = min(due, evaluator.iterations_until_due(counters))
         number = broadcast(host, min(reporter.allowance(iteration), due, MAX_PER_CALL))
-        if not number:
+        stop_named(job.members, counters, reporter.stopped())
+        if not number or not any(budget_left(config, c) for c in counters):
             break
+        population.stop([p for p, own in enumerate(counters) if own.stopped])
         clock = time.perf_counter()
         reports = population.run(iteration, number)
         seconds = time.perf_counter() - clock
-        iteration = _report(job, reporter, iteration, reports, counters, seconds)
+        watch = evaluator, population
+        iteration = _report(job, reporter, iteration, reports, counters, seconds, watch)
         if iteration % config.checkpoint_every == 0:
-            reporter.state(iteration, pack(job, population, counters))
-    reporter.state(iteration, pack(job, population, counters))
+            reporter.state(iteration, pack(job, population, counters) | evaluator.to_arrays())
+    reporter.state(iteration, pack(job, population, counters) | evaluator.to_arrays())
+
+
+def make_evaluator(job: Job, population: Population) -> Evaluator:
+    """Makes what evaluates the members of a population."""
+    player = DevicePlayer(job, population.parts.collecting.env, population.policy)
+    return Evaluator(job, population.policy, player)
+
+
+def _frozen(population: Population, p: int) -> Frozen:
+    """What member `p` acts with now."""
+    state = population.states()[p]
+    return Frozen(np.asarray(state.learner.params), _moments(state))
 
 
 def _settings(job: Job) -> str:
@@ -133,7 +159,7 @@ def _devices(config: Config) -> list[Any]:
     if found[0].platform != config.device:
         raise BadInput(f"device: JAX uses the {found[0].platform} here, not the {config.device}")
     if wanted > len(found):
-        raise BadInput(f"devices: {wanted} asked for, {len(found)} are there")
+        raise BadInput(f"devices: {wanted} asked for, this machine has {len(found)}")
     return found[:wanted] if wanted else found
 
 
@@ -150,27 +176,39 @@ def _report(
     reports: list[Report],
     counters: list[Counters],
     seconds: float,
+    watch: tuple[Evaluator, Population],
 ) -> int:
-    """Reports what one call ran; the iteration that comes next."""
+    """Reports what one call ran; the iteration that comes next.
+
+    Args:
+      watch: what evaluates a member if that is due (then the iteration is the call's last), and
+        who they are.
+    """
+    evaluator, population = watch
     ran = np.stack([report.ran for report in reports])  # [P, MAX_PER_CALL]
     number = int(ran.any(0).sum())
     for i in range(number):
-        rows, steps = [], 0
-        for p in np.flatnonzero(ran[:, i]):
+        rows, steps, evaluated = [], 0, evaluator.seconds
+        for p in np.flatnonzero(ran[:, i]).tolist():
             report = jax.tree.map(lambda x: x[i], reports[p])  # noqa: B023
             member = job.members[p]
-            _check_sound(member, first + i, report)
+            _check_finite(member, first + i, report)
             collected = _collected(report)
+            before = counters[p].env_steps
             counters[p].add(collected)
             steps += collected.env_steps
-            rows.append(_row(member, job.config, first + i, collected, counters[p], report))
+            row = _row(member, job.config, first + i, collected, counters[p], report)
+            frozen = partial(_frozen, population, p)
+            rows.append(row | evaluator.after(p, counters[p], before, frozen))
         timing = {"env_steps": steps, "seconds": seconds / number}
+        if evaluating := evaluator.seconds - evaluated:
+            timing["evaluation_seconds"] = evaluating
         reporter.iteration(first + i, rows, timing)
     return first + number
 
 
-def _check_sound(member: Member, iteration: int, report: Report) -> None:
-    if is_sound(report):
+def _check_finite(member: Member, iteration: int, report: Report) -> None:
+    if is_finite(report):
         return
     if report.faults.found:
         what = "reward" if report.faults.in_reward else "observation"
@@ -232,13 +270,20 @@ def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arra
     arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
     arrays |= named_optimizer(learner) | named_sampler(learner)
     arrays |= counters.to_arrays()
-    moments = state.collect.observation_moments
-    if isinstance(moments, LongMoments):  # where a trained policy looks for them, as the host's
-        for name in Moments._fields:
-            lost = np.asarray(getattr(moments, f"{name}_lost"), np.float64)
-            arrays[f"observation_moments/{name}"] = np.asarray(getattr(moments, name)) + lost
+    moments = _moments(state)
+    if moments is not None:  # where a trained policy looks for them, as the host's
+        arrays |= {f"observation_moments/{name}": a for name, a in moments._asdict().items()}
     arrays |= {f"collect/{name}": a for name, a in named_leaves(state.collect).items()}
     return {name: np.array(array) for name, array in arrays.items()}
+
+
+def _moments(state: MemberState) -> Moments | None:
+    """The moments of the observations in float64, as the host has them."""
+    moments = state.collect.observation_moments
+    if not isinstance(moments, LongMoments):
+        return None
+    lost = (np.asarray(part, np.float64) for part in moments[3:])
+    return Moments(*(np.asarray(a) + b for a, b in zip(moments[:3], lost, strict=True)))
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
@@ -273,6 +318,26 @@ def filled(example: Any, arrays: Mapping[str, np.ndarray]) -> Any:
             array = jax.random.wrap_key_data(array, impl=jax.random.key_impl(leaf))
         found.append(array)
     return jax.tree_util.tree_unflatten(structure, found)
+
+
+def _initialise(job: Job, population: Population, arrays: Mapping[str, np.ndarray]) -> None:
+    """Starts all members from trained ones."""
+    states = []
+    for member, fresh in zip(job.members, population.states(), strict=True):
+        own = under(member.name + "/", arrays)
+        params = initial_params(population.policy, fresh.learner.params, own)
+        kept: dict[str, Any] = {}
+        for kind in ("observation_moments", "reward_moments"):
+            example = getattr(fresh.collect, kind)
+            if not isinstance(example, LongMoments):
+                continue
+            if (found := initial_moments(kind, own, example.mean.shape)) is not None:
+                kept[kind] = as_long_moments(found, example)
+        collect = fresh.collect._replace(**kept)
+        states.append(
+            fresh._replace(learner=fresh.learner._replace(params=params), collect=collect)
+        )
+    population.restore(states)
 
 
 def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray]) -> list[Counters]:

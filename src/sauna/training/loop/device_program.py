@@ -165,7 +165,7 @@ def several(
         i, state, reports, _ = now
         state, report = iterate(state, setting, first + i)
         reports = jax.tree.map(lambda all, x: all.at[i].set(x), reports, report)
-        return i + 1, state, reports, jnp.all(is_sound(report)) & jnp.any(report.ran)
+        return i + 1, state, reports, jnp.all(is_finite(report)) & jnp.any(report.ran)
 
     _, state, reports, _ = jax.lax.while_loop(
         not_last, step, (jnp.int32(0), state, empty, jnp.bool_(True))
@@ -173,7 +173,7 @@ def several(
     return state, reports
 
 
-def is_sound(report: Report) -> Any:
+def is_finite(report: Report) -> Any:
     """Whether every number of an iteration (or of many) is finite."""
     return ~report.ran | (report.learned.finite & ~report.faults.found)
 
@@ -263,6 +263,15 @@ class Population:
             self._state[p], report = self._run(self._state[p], self._settings[p], *span)
             reports.append(jax.device_get(report))
         return reports
+
+    def stop(self, members: list[int]) -> None:
+        """Leaves these members as they are from now on: their budget holds no further rollout."""
+        for p in members:
+            if self._one_by_one:
+                self._settings[p] = self._settings[p]._replace(steps=jnp.int32(1))
+            else:
+                steps = self._settings.steps.at[p].set(1)
+                self._settings = self._settings._replace(steps=steps)
 
     def states(self) -> list[MemberState]:
         """Every member's state, as numpy arrays (and JAX keys)."""

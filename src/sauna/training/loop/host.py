@@ -8,6 +8,7 @@ This is the loop itself. Who starts it, what is shown of it and where its messag
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,8 +26,16 @@ from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
 from sauna.training.loop.budget import budget_left, hypers_now, step_limit
+from sauna.training.loop.evaluation import Evaluator, Frozen, HostPlayer, stop_named
+from sauna.training.loop.fine_tuning import initial_moments, initial_params
 from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
-from sauna.training.loop.member_state import Counters, pack_member, unpack_member
+from sauna.training.loop.member_state import (
+    Counters,
+    moments_of,
+    pack_member,
+    under,
+    unpack_member,
+)
 from sauna.training.loop.metrics import metrics_row
 
 
@@ -43,24 +52,29 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
     learner = make_learner(config, program.policy, job.spaces)
     keys = [member_keys(member.seed) for member in members]
     draw_key = jax.jit(selection_key)
-    envs = make_envs(job)
+    envs, player = make_envs(job), HostPlayer(job)
+    evaluator = Evaluator(job, program.policy, player)
     try:
         collector = HostCollector(program, job.spaces, envs, keys)
         states, counters = _start(job, program, learner, keys, collector, envs)
         reporter.phase("compiling")
         iteration = job.start
         while any(budget_left(config, c) for c in counters) and reporter.allowance(iteration):
+            stop_named(members, counters, reporter.stopped())
             clock, cpu = time.perf_counter(), time.process_time()
+            evaluating = evaluator.seconds
             hypers = [
                 hypers_now(one.config, own) for one, own in zip(members, counters, strict=True)
             ]
             limit = np.array([step_limit(config, c) for c in counters])
+            if not limit.any():
+                break
             params = np.stack([np.asarray(state.params) for state in states])
             collected = collector.collect(params, hypers, iteration, limit)
             collect_seconds = time.perf_counter() - clock
             collect_cpu = time.process_time() - cpu
             rows, update_cpu = [], {}
-            for p in np.flatnonzero(limit):
+            for p in np.flatnonzero(limit).tolist():
                 cpu = time.process_time()
                 order = minibatch_order(config, members[p].seed, iteration)
                 states[p], learned = _learn(
@@ -68,34 +82,38 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
                 )
                 update_cpu[members[p].name] = time.process_time() - cpu
                 check_finite(members[p], iteration, learned)
+                steps = counters[p].env_steps
                 counters[p].add(collected[p])
-                rows.append(
-                    metrics_row(
-                        members[p],
-                        config,
-                        iteration,
-                        collected[p],
-                        counters[p],
-                        learned,
-                        hypers[p],
-                    )
+                row = metrics_row(
+                    members[p], config, iteration, collected[p], counters[p], learned, hypers[p]
                 )
+                frozen = partial(_frozen, states[p], collector, p)
+                rows.append(row | evaluator.after(p, counters[p], steps, frozen))
+            evaluating = evaluator.seconds - evaluating
             timing: dict[str, Any] = {
                 "env_steps": sum(collected[p].env_steps for p in np.flatnonzero(limit)),
-                "seconds": time.perf_counter() - clock,
+                "seconds": time.perf_counter() - clock - evaluating,
                 "collect_seconds": collect_seconds,
                 "collect_cpu_seconds": collect_cpu,
                 "update_cpu_seconds": update_cpu,
+                **({"evaluation_seconds": evaluating} if evaluating else {}),
             }
             reporter.iteration(iteration, rows, timing)
             iteration += 1
             if iteration % config.checkpoint_every == 0:
-                reporter.state(
-                    iteration, _pack(program, members, states, counters, collector, envs)
-                )
-        reporter.state(iteration, _pack(program, members, states, counters, collector, envs))
+                packed = _pack(program, members, states, counters, collector, envs)
+                reporter.state(iteration, packed | evaluator.to_arrays())
+        packed = _pack(program, members, states, counters, collector, envs)
+        reporter.state(iteration, packed | evaluator.to_arrays())
     finally:
+        player.close()
         envs.close()
+
+
+def _frozen(state: TrainState, collector: HostCollector, p: int) -> Frozen:
+    """What member `p` acts with now."""
+    moments = collector.observation_moments
+    return Frozen(state.params, None if moments is None else moments.of(p))
 
 
 def make_envs(job: Job) -> HostEnvs:
@@ -127,7 +145,24 @@ def _start(
             states[p], counters[p] = unpack_member(
                 member.name, p, job.restored, states[p], program.policy, collector, envs, job.replay
             )
+    elif job.initial:
+        for p, member in enumerate(job.members):
+            own = under(f"{member.name}/", job.initial)
+            params = initial_params(program.policy, states[p].params, own)
+            states[p] = states[p]._replace(params=params)
+            _keep_moments(collector, p, own)
     return states, counters
+
+
+def _keep_moments(collector: HostCollector, p: int, own: Arrays) -> None:
+    """Lets member `p` go on with the running moments that it starts from."""
+    views = moments_of(collector, p)
+    for kind in ("observation_moments", "reward_moments"):
+        if f"{kind}/mean" not in views:
+            continue
+        found = initial_moments(kind, own, views[f"{kind}/mean"].shape)
+        for name, value in (found._asdict() if found else {}).items():
+            views[f"{kind}/{name}"][...] = value
 
 
 def _learn(

@@ -30,6 +30,9 @@ class Reporter(Protocol):
     def allowance(self, iteration: int) -> int:
         """Waits until `iteration` may start; returns how many may from there on. 0: stop."""
 
+    def stopped(self) -> set[str]:
+        """Names the members that a callback has stopped; right after `allowance`."""
+
     def iteration(self, iteration: int, rows: list[dict[str, Any]], timing: dict[str, Any]) -> None:
         """Reports a finished iteration."""
 
@@ -45,6 +48,7 @@ class Job(NamedTuple):
     env_kwargs: dict[str, Any]
     members: list[Member]
     restored: Mapping[str, np.ndarray] | None = None  # a checkpoint's arrays; None: start afresh
+    initial: Mapping[str, np.ndarray] | None = None  # of trained members, to start afresh from
     start: int = 0  # the first iteration to run
     replay: bool = True  # whether environments can be brought back by replaying
 

@@ -42,6 +42,7 @@ class Counters:
     episodes: int = 0
     recent_returns: list[float] = field(default_factory=list)  # of the last `WINDOW` episodes
     reported_returns: list[float] = field(default_factory=list)  # those that ended on a kept step
+    stopped: int = 0  # why the member was stopped early: its index in `STOPS`
 
     def add(self, collected: Collected) -> None:
         self.env_steps += collected.env_steps
@@ -53,18 +54,21 @@ class Counters:
         self.reported_returns = (self.reported_returns + reported)[-WINDOW:]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Named as in a checkpoint."""
+        """Named as in a checkpoint; `stopped` is there only if the member was."""
         return {
             f"counters/{key}": np.asarray(
                 value, np.float64 if isinstance(value, list) else np.int64
             )
             for key, value in dataclasses.asdict(self).items()
+            if key != "stopped" or value
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Counters:
         """The inverse of `to_arrays`."""
         names = [part.name for part in dataclasses.fields(cls)]
+        if "counters/stopped" not in arrays:
+            names.remove("stopped")
         return cls(**{name: arrays[f"counters/{name}"].tolist() for name in names})
 
 

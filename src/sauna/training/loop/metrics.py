@@ -9,19 +9,13 @@ import numpy as np
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
-
-SUCCESS_RATE, INFO_PREFIX = "success_rate", "info_"
+from sauna.envs.info import info_key
 
 if TYPE_CHECKING:
     from sauna.algorithm.learner.metrics import UpdateMetrics
     from sauna.algorithm.rollout.collected import Collected
     from sauna.algorithm.types import Hypers
     from sauna.training.loop.member_state import Counters
-
-
-def info_key(name: str) -> str:
-    """The key in a row of a number that environments give in `info`."""
-    return SUCCESS_RATE if name == "is_success" else INFO_PREFIX + name
 
 
 def metrics_row(

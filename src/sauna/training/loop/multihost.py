@@ -46,7 +46,7 @@ def read_host_rank(text: str) -> HostRank:
 
 
 def join(host: HostRank) -> None:
-    """Waits until all machines are there, once. Before anything else is asked of JAX."""
+    """Waits until all machines have joined, once. Before anything else is asked of JAX."""
     if host.hosts > 1:
         import jax
 
@@ -135,6 +135,9 @@ class Follower:
 
     def allowance(self, iteration: int) -> int:
         return 1  # machine 0 says how many
+
+    def stopped(self) -> set[str]:
+        return set()
 
     def iteration(self, iteration: int, rows: Any, timing: Any) -> None:
         pass

@@ -28,6 +28,7 @@ class Cell:
 
     def __init__(self, config: Config) -> None:
         self.seeds = config.seeds
+        self.has_sampler = config.sampler != "none"
         self.latest: dict[int, dict[str, Any]] = {}  # seed -> its last row
         self.complete: set[int] = set()
         self.failed: set[int] = set()
@@ -75,6 +76,14 @@ class Cell:
         rows = [row for seed, row in self.latest.items() if seed not in self.failed]
         values = [row[name] for row in rows if name in row]
         return sum(values) / len(values) if values else None
+
+    def shares(self) -> str:
+        """Says what share of the env steps is kept, and of the samples used if a sampler
+        chooses."""
+        said = f"keep rate {number(self.mean('keep_rate'), 3)}"
+        if self.has_sampler:
+            said += f", samples used {number(self.mean('sample_rate'), 3)}"
+        return said
 
     def rate(self) -> float | None:
         """Returns env steps per second of late."""
@@ -191,7 +200,7 @@ class StudyView:
         running = [(key, cell) for key, cell in self._cells.items() if cell.running]
         shown = "".join(
             f"; {label} on {task} {cell.marks()} return {number(cell.mean('return_mean'), 1)}, "
-            f"keep rate {number(cell.mean('keep_rate'), 3)}"
+            f"{cell.shares()}"
             for (label, task), cell in running[:NAMED]
         )
         return shown + (f"; {len(running) - NAMED} more" if len(running) > NAMED else "")
@@ -207,7 +216,9 @@ class StudyView:
         table = Table(title=self._status(), title_justify="left", box=None)
         for column in ("task", "arm", "seeds"):
             table.add_column(column)
-        for column in ("progress", "return", "keep rate", "env steps/s"):
+        sampled = any(cell.has_sampler for cell in self._cells.values())
+        used = ["samples used"] if sampled else []
+        for column in ("progress", "return", "keep rate", *used, "env steps/s"):
             table.add_column(column, justify="right")
         for (label, task), cell in shown.items():
             share = sum(map(cell.share, cell.seeds)) / len(cell.seeds)
@@ -218,6 +229,7 @@ class StudyView:
                 f"{share:.0%}",
                 number(cell.mean("return_mean"), 1),
                 number(cell.mean("keep_rate"), 3),
+                *([number(cell.mean("sample_rate"), 3)] if sampled else []),
                 number(cell.rate(), 0),
             )
         if len(shown) < len(self._cells):

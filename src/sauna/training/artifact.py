@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,6 +76,35 @@ def _newest(run: Path, warn: Callable[[str], None]) -> checkpoint.Checkpoint | N
         loaded = checkpoint.load_newest(run / "checkpoints", lambda text: None)
         warn("warning: no checkpoint has all its rows; the newest one is used")
         return loaded
+
+
+def best_of(artifact: Artifact, member: str) -> dict[str, Any]:
+    """Finds the parameters and the normaliser of a member's best evaluation during training.
+
+    Raises:
+      BadInput: it was not evaluated during training.
+    """
+    prefix = f"{member}/best/"
+    arrays = artifact.checkpoint.arrays
+    found = {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
+    if not found:
+        raise BadInput(f"best: {member} was not evaluated during training; see --eval-every")
+    return found
+
+
+def best_steps(artifact: Artifact, members: Sequence[str]) -> dict[str, int]:
+    """Finds after how many env steps of training each member had its best evaluation.
+
+    Raises:
+      BadInput: one was not evaluated during training.
+    """
+    for member in members:
+        best_of(artifact, member)
+    arrays = artifact.checkpoint.arrays
+    try:
+        return {name: int(arrays[f"{name}/evaluation/best_env_steps"]) for name in members}
+    except (KeyError, TypeError, ValueError) as error:
+        raise checkpoint.BadCheckpoint(f"{artifact.checkpoint.path}: {error}") from error
 
 
 def find_member(members: list[str], member: str | int) -> str:

@@ -1,0 +1,94 @@
+"""Which sources of this package train: their digest, and whether somebody edited them.
+
+A run stores both under `code["sauna"]`, as `REVISION DIGEST`. The revision is the version of the
+package, or the git revision of a checkout, which ends in `+changes` while its sources are edited.
+So a new version is told from an edit: the first is named, the second is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import subprocess
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+KEY = "sauna"
+PACKAGE = Path(__file__).parents[1]
+COMPUTING = ("algorithm", "envs", "training/loop")  # folders whose code decides a run's numbers
+EDITED = "+changes"
+
+
+@cache
+def own_sources() -> str:
+    """`REVISION DIGEST` of the sources that this process has imported, or would import."""
+    return sources_of(PACKAGE)
+
+
+def sources_of(package: Path) -> str:
+    """`REVISION DIGEST` of a package's folder."""
+    return f"{_revision(package)} {_digest(package)}"
+
+
+def edited_sources(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Says how sources differ if an edit made them differ; empty if not.
+
+    A run that was stored without them counts as unchanged.
+    """
+    old, new = _parts(before), _parts(now)
+    if old is None or new is None or old[1] == new[1]:
+        return ""
+    if old[0] != new[0] and not (old[0] + new[0]).count(EDITED):
+        return ""
+    return f"sauna's own sources, {old[0]} -> {new[0]}, were edited"
+
+
+def newer_sources(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """Says how sources differ if they are of two versions, none of them edited; empty if not."""
+    old, new = _parts(before), _parts(now)
+    if old is None or new is None or old[1] == new[1] or edited_sources(before, now):
+        return ""
+    return f"sauna {old[0]}, today's is {new[0]}"
+
+
+def _parts(code: Mapping[str, str]) -> tuple[str, str] | None:
+    revision, _, digest = code.get(KEY, "").partition(" ")
+    return (revision, digest) if digest else None
+
+
+def _digest(package: Path) -> str:
+    found = hashlib.sha256()
+    files = [path for name in COMPUTING for path in (package / name).rglob("*.py")]
+    for path in sorted(files, key=lambda path: path.relative_to(package).as_posix()):
+        content = path.read_bytes()
+        found.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode())
+        found.update(content)
+    return found.hexdigest()
+
+
+def _revision(package: Path) -> str:
+    """The git revision if git tracks the package's files, else the installed version."""
+    try:
+        _git(package, "ls-files", "--error-unmatch", "--", "__init__.py")
+        revision = _git(package, "rev-parse", "--short=12", "HEAD")
+        edited = _git(package, "status", "--porcelain", "--", *COMPUTING)
+    except (OSError, subprocess.SubprocessError):
+        return _version()
+    return revision + (EDITED if edited else "")
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """Asks git, without a lock in the way of the user's commands, or a hook's variables."""
+    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
+    env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5, env=env)
+    return done.stdout.strip()
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("sauna-rl")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,172 @@
+"""Fine-tuning: the weights and the normaliser of a trained run, from which a new run starts.
+
+They are copied into the new run's directory before it begins (`init/`), so that what becomes of the
+other run does not matter any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sauna.config.presets import Member
+from sauna.config.settings import Config
+from sauna.envs.spaces import difference
+from sauna.system import checkpoint
+from sauna.system.errors import BadInput
+from sauna.system.run_directory import INITIAL
+from sauna.training.artifact import Artifact, best_of, find_member, load_artifact
+from sauna.training.prepare import Prepared
+
+# What has to be the same, beside the spaces, for weights to mean the same.
+SHAPES = (
+    "network",
+    "hidden",
+    "activation",
+    "trunk",
+    "rescale_actions",
+    "normalize_observations",
+)
+
+
+class Source:
+    """The run, the member and the moment that `init_from` names."""
+
+    def __init__(self, text: str) -> None:
+        path, self.best = Path(text), False
+        if path.name == "best":
+            path, self.best = path.parent, True
+        self.run, self.member = path, ""
+        if not _is_run(path) and _is_run(path.parent.parent):
+            self.run, self.member = path.parent.parent, "/".join(path.parts[-2:])
+
+
+def _is_run(path: Path) -> bool:
+    return (path / "config.json").is_file()
+
+
+def read_initial(
+    prepared: Prepared, say: Callable[[str], None], trust: bool
+) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+    """Reads what the members of a new run start from; None: they start afresh.
+
+    Returns:
+      arrays, named as in a checkpoint of the new run, and where they come from.
+
+    Raises:
+      BadInput: there is no such run or member, it is somebody else's and not trusted, or its spaces
+        or its network differ; the part is named.
+    """
+    config = prepared.config
+    if not config.init_from:
+        return None
+    source = Source(config.init_from)
+    if not _is_run(source.run):
+        raise BadInput(f"init_from: {config.init_from} is no run, and no RUN/ARM/SEED of one")
+    artifact = load_artifact(source.run, say, trust=trust)
+    check_fits(artifact, prepared)
+    arrays: dict[str, np.ndarray] = {}
+    chosen = {}
+    for member in prepared.members:
+        chosen[member.name] = name = _source_of(member, artifact.members, source.member)
+        own = _arrays_of(artifact, name, source.best, config.init_normalizer)
+        arrays |= {f"{member.name}/{key}": array for key, array in own.items()}
+    manifest = artifact.checkpoint.manifest
+    origin = {
+        "run": str(source.run),
+        "iteration": manifest["iteration"],
+        "sha256": manifest["sha256"],
+        "best": source.best,
+        "members": chosen,
+    }
+    return arrays, origin
+
+
+def check_fits(artifact: Artifact, prepared: Prepared) -> None:
+    """Refuses a run whose weights would mean something else here.
+
+    Raises:
+      BadInput: naming the part that differs.
+    """
+    name, theirs, ours = prepared.config.init_from, artifact.config, prepared.config
+    if differs := difference(artifact.spaces, prepared.spaces):
+        raise BadInput(f"init_from: {name} has other spaces than {ours.env}: {differs}")
+    for field in SHAPES:
+        before, now = getattr(theirs, field), getattr(ours, field)
+        if before != now and _matters(field, ours):
+            raise BadInput(
+                f"init_from: {field} is {_text(before)} in {name}, and {_text(now)} here"
+            )
+
+
+def _matters(field: str, config: Config) -> bool:
+    return field not in ("hidden", "activation") or config.network == "mlp"
+
+
+def _text(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _source_of(member: Member, known: list[str], named: str) -> str:
+    """Names the member that `member` starts from: the named one, the only one, or its namesake.
+
+    In a run of one arm, that of the same seed is the namesake.
+    """
+    if named:
+        return find_member(known, named)
+    if len(known) == 1:
+        return known[0]
+    arms = {name.rpartition("/")[0] for name in known}
+    arm = member.arm if len(arms) > 1 else next(iter(arms))
+    if f"{arm}/{member.seed}" not in known:
+        raise BadInput(
+            f"init_from: no member {arm}/{member.seed} for {member.name}; name one: "
+            f"RUN/{known[0]} (there are: {', '.join(known)})"
+        )
+    return f"{arm}/{member.seed}"
+
+
+def _arrays_of(artifact: Artifact, name: str, best: bool, normalizer: str) -> dict[str, np.ndarray]:
+    """A member's parameters, and as much of its running statistics as is kept."""
+    prefix = f"{name}/"
+    stored = artifact.checkpoint.arrays
+    own = {key[len(prefix) :]: a for key, a in stored.items() if key.startswith(prefix)}
+    policy = best_of(artifact, name) if best else own
+    found = {key: a for key, a in policy.items() if key.startswith("params/")}
+    if normalizer != "fresh":
+        found |= {key: a for key, a in policy.items() if key.startswith("observation_moments/")}
+    if normalizer == "kept":
+        found |= _reward_moments(own)
+    return found
+
+
+def _reward_moments(own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The running moments of rewards in float64, as the host has them."""
+    found = {}
+    for part in ("mean", "variance", "count"):
+        name = f"reward_moments/{part}"
+        if name in own:
+            found[name] = own[name]
+        elif f"collect/{name}" in own:
+            lost = own.get(f"collect/{name}_lost", np.zeros(1))
+            found[name] = own[f"collect/{name}"].astype(np.float64) + lost
+    return found
+
+
+def save_initial(run: Path, arrays: dict[str, np.ndarray], manifest: dict[str, Any]) -> None:
+    """Copies what a run starts from into its directory."""
+    checkpoint.save_checkpoint(run / INITIAL, 0, arrays, manifest, keep=1)
+
+
+def load_initial(run: Path, config: Config) -> dict[str, np.ndarray]:
+    """Loads what a run starts from; nothing if it starts afresh.
+
+    Raises:
+      BadCheckpoint: it is missing, or not what was written.
+    """
+    if not config.init_from:
+        return {}
+    return checkpoint.load_checkpoint(run / INITIAL / f"{0:08d}").arrays

@@ -1,0 +1,165 @@
+"""Evaluations while a run trains: when, what they say, what they stop, what they leave alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sauna
+from helpers import SMALL, Recorder, equal, make_job, own, resumed, train_here
+from sauna.algorithm.rollout.play import Episode
+from sauna.config.presets import resolve
+from sauna.system.errors import BadInput
+from sauna.training.loop.evaluation import Evaluated
+from sauna.training.summary import STOPS, summarize
+from sauna.training.worker import train_members
+
+BACKENDS = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}
+WATCHED = {"eval_every": 64, "eval_episodes": 3, "checkpoint_every": 1}
+
+
+def of(backend: str, **settings: Any) -> Any:
+    return make_job(BACKENDS[backend], **{"arm": "ppo", "steps": 192, "seeds": 2, **settings})
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def both(request) -> tuple[str, Recorder, Recorder]:
+    """The same training of two members with and without evaluations."""
+    backend = request.param
+    return backend, train_here(of(backend)), train_here(of(backend, **WATCHED))
+
+
+def training(rows: list[dict]) -> list[dict]:
+    return [{k: v for k, v in row.items() if not k.startswith("eval_")} for row in rows]
+
+
+def states(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {k: v for k, v in arrays.items() if "/evaluation/" not in k and "/best/" not in k}
+
+
+def test_evaluations_change_no_bit_of_training(both) -> None:
+    _, plain, watched = both
+    assert plain.rows == training(watched.rows) and plain.rows != watched.rows
+    assert equal(plain.final, states(watched.final))
+    assert plain.final.keys() != watched.final.keys()
+
+
+def test_every_multiple_is_evaluated_once_by_seeds_of_its_own(both) -> None:
+    _, _, watched = both
+    rows = [row for row in watched.rows if "eval_returns" in row]
+    assert [row["env_steps"] for row in rows] == [64, 64, 128, 128, 192, 192]
+    assert all(len(row["eval_returns"]) == 3 for row in rows)
+    assert len({tuple(row["eval_returns"]) for row in rows}) == 6
+    for name in ("ppo/0", "ppo/1"):
+        mine = [row for row in rows if row["member"] == name]
+        lengths = [3 * row["eval_length_mean"] for row in mine]
+        np.testing.assert_allclose([row["eval_env_steps"] for row in mine], np.cumsum(lengths))
+        bests = np.maximum.accumulate([row["eval_return_mean"] for row in mine])
+        assert [row["eval_return_best"] for row in mine] == bests.tolist()
+        np.testing.assert_allclose(mine[0]["eval_return_std"], np.std(mine[0]["eval_returns"]))
+
+
+@pytest.mark.parametrize("stop", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))])
+def test_a_resumed_run_has_the_same_evaluations(both, stop: int) -> None:
+    backend, _, watched = both
+    job = of(backend, **WATCHED)
+    first = train_here(job, stop)
+    second = train_here(resumed(job, first))
+    assert first.rows + second.rows == watched.rows and equal(second.final, watched.final)
+
+
+def test_the_best_policy_is_kept_as_it_was(both) -> None:
+    """It is that of the checkpoint after which the best evaluation came."""
+    _, _, watched = both
+    for name in ("ppo/0", "ppo/1"):
+        mine = [row for row in watched.rows if row["member"] == name and "eval_returns" in row]
+        best = max(mine, key=lambda row: row["eval_return_mean"])
+        final = own(watched.final, name)
+        assert final["/evaluation/best_env_steps"] == best["env_steps"]
+        then = own(watched.states[best["iteration"] + 1], name)
+        kept = {k.removeprefix("/best"): v for k, v in final.items() if k.startswith("/best/")}
+        assert kept and equal(kept, {key: then[key] for key in kept})
+
+
+def test_a_member_that_stops_early_changes_no_other(both) -> None:
+    backend, _, whole = both
+    reached = [row for row in whole.rows if row.get("env_steps") == 64]
+    low, high = sorted(reached, key=lambda row: row["eval_return_mean"])
+    level = (low["eval_return_mean"] + high["eval_return_mean"]) / 2
+    stopped = train_here(of(backend, stop_at=level, **WATCHED))
+    gone, left = high["member"], low["member"]
+    last = [row for row in stopped.rows if row["member"] == gone][-1]
+    assert last["env_steps"] == 64 and last == high
+    others = [row for row in whole.rows if row["member"] == left]
+    mine = [row for row in stopped.rows if row["member"] == left]
+    assert len(mine) > 2 and mine == others[: len(mine)]
+    assert stopped.final[f"{gone}/counters/stopped"] == STOPS.index("stop_at")
+    again = train_here(resumed(of(backend, stop_at=level, **WATCHED), stopped))
+    assert again.rows == [] and equal(again.final, stopped.final)
+
+
+class Stopping(Recorder):
+    """Stops one member once a row of iteration 1 was seen, as a callback does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+
+    def allowance(self, iteration: int) -> int:
+        return 1
+
+    def iteration(self, iteration: int, rows: list[dict], timing: dict) -> None:
+        super().iteration(iteration, rows, timing)
+        if iteration == 1:
+            self.names.add("ppo/0")
+
+    def stopped(self) -> set[str]:
+        return self.names
+
+
+def test_a_callback_stops_a_member_after_the_row_that_it_saw(both) -> None:
+    (backend, whole, _), stopped = both, Stopping()
+    train_members(of(backend), stopped)
+    rows = [row for row in whole.rows if row["member"] == "ppo/1" or row["iteration"] <= 1]
+    assert stopped.rows == rows
+    assert stopped.final["ppo/0/counters/stopped"] == STOPS.index("callback")
+    assert equal(own(stopped.final, "ppo/1"), own(whole.final, "ppo/1"))
+
+
+def test_a_flat_curve_stops_a_member_after_so_many_evaluations() -> None:
+    config = resolve({"env": "none", "eval_every": 10, "stop_when_flat": 2})
+    found, stops = Evaluated(), []
+    for number, return_ in enumerate([1.0, 3.0, 3.0, 2.0, 5.0]):
+        row = found.see([Episode(return_, 7, False)], 10 * number, dict)
+        stops.append(found.stop(config, row["eval_return_mean"]))
+    flat = STOPS.index("stop_when_flat")
+    assert stops == [0, 0, 0, flat, 0]  # the fourth is the second without a new best
+    assert (found.best, found.best_env_steps, found.env_steps) == (5.0, 40, 35)
+
+
+def test_stops_and_the_last_evaluation_stand_in_the_summary() -> None:
+    rows = [
+        {"member": "ppo/0", "env_steps": 10, "eval_return_mean": 4.0, "eval_returns": [4.0]},
+        {"member": "ppo/0", "env_steps": 20, "return_mean": 3.0},
+        {"member": "ppo/1", "env_steps": 30},
+    ]
+    arrays = {"ppo/0/counters/stopped": np.array(STOPS.index("stop_at"))}
+    assert summarize(rows, arrays) == {
+        "ppo/0": {
+            "env_steps": 20,
+            "return_mean": 3.0,
+            "eval_return_mean": 4.0,
+            "stopped_early": "stop_at",
+        },
+        "ppo/1": {"env_steps": 30},
+    }
+
+
+@pytest.mark.parametrize("name", ["eval_episodes", "stop_at", "stop_when_flat"])
+def test_what_only_evaluations_read_is_refused_without_them(name: str, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=f"{name}: not read .* it needs eval_every above 0"):
+        sauna.train("worlds:Scripted", out=tmp_path / "run", **{**SMALL, name: 3})
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,146 @@
+"""A run that starts from the weights of a trained one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sauna
+from faults.canned import BACKENDS
+from helpers import SMALL, equal, make_job, train_here
+from sauna.config.presets import Member
+from sauna.config.settings import Config
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput
+from sauna.training.initial import Source, _reward_moments, _source_of, read_initial
+from sauna.training.loop.member_state import under
+from sauna.training.prepare import prepare
+from threads import trained_here
+
+SETTINGS: dict[str, Any] = {**SMALL, "arm": "ppo", "processes": 1, "seeds": 2}
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def trained(request, tmp_path_factory) -> tuple[str, Path]:
+    """A trained run, with evaluations."""
+    env, run = BACKENDS[request.param], tmp_path_factory.mktemp("trained") / "run"
+    with trained_here():
+        sauna.train(env, out=run, quiet=True, eval_every=64, eval_episodes=1, **SETTINGS)
+    return env, run
+
+
+def initial(env: str, text: Path | str, **more: Any) -> dict[str, np.ndarray]:
+    found = read_initial(
+        prepare({"env": env, **SETTINGS, "init_from": str(text), **more}), print, False
+    )
+    assert found is not None
+    return found[0]
+
+
+def final(run: Path) -> dict[str, np.ndarray]:
+    loaded = checkpoint.load_newest(run / "checkpoints", print)
+    assert loaded is not None
+    return loaded.arrays
+
+
+@pytest.mark.parametrize("normalizer", ["kept", "observations", "fresh"])
+def test_weights_and_what_is_kept_of_the_normaliser_are_the_first_state(
+    trained, normalizer
+) -> None:
+    env, run = trained
+    job = make_job(env, **{**SETTINGS, "arm": "sauna"})
+    fresh = under("sauna/1/", train_here(job, stop=0).final)
+    arrays = initial(env, run, arm="sauna", init_normalizer=normalizer)
+    state = under("sauna/1/", train_here(job._replace(initial=arrays), stop=0).final)
+    source = under("ppo/1/", final(run))
+    for name, expected in (
+        ("params", source),
+        ("adam", fresh),
+        ("observation_moments", fresh if normalizer == "fresh" else source),
+    ):
+        assert equal(under(f"{name}/", state), under(f"{name}/", expected)), name
+    assert not equal(under("params/", state), under("params/", fresh))
+    scaled = source if normalizer == "kept" else fresh
+    assert equal(_reward_moments(state), _reward_moments(scaled)) and _reward_moments(state)
+    others = [name for name in fresh if name.startswith(("counters/", "envs/", "sampler/"))]
+    assert all(equal({n: state[n]}, {n: fresh[n]}) for n in others)
+
+
+def test_the_best_of_a_named_member_can_be_taken(trained) -> None:
+    env, run = trained
+    arrays = initial(env, run / "ppo" / "1" / "best")
+    best = under("ppo/1/best/params/", final(run))
+    for name in ("ppo/0", "ppo/1"):
+        assert equal(under(f"{name}/params/", arrays), best)
+
+
+def test_it_is_copied_so_that_a_resume_needs_no_other_run(trained, tmp_path: Path) -> None:
+    env, source = trained
+    run = tmp_path / "run"
+    with trained_here():
+        sauna.train(env, out=run, quiet=True, init_from=str(source), **SETTINGS)
+        expected = (run / "metrics.jsonl").read_bytes()
+        stored = run_directory.read_config(run)
+        assert stored["initial"]["members"] == {"ppo/0": "ppo/0", "ppo/1": "ppo/1"}
+        stored["config"]["init_from"] = "nowhere"  # as if it were gone
+        (run / "summary.json").unlink()
+        (run / "checkpoints").rename(run / "killed-before-the-first")
+        run_directory.write_config(run, stored)
+        sauna.resume(run, quiet=True)
+    assert (run / "metrics.jsonl").read_bytes() == expected
+    assert expected != (source / "metrics.jsonl").read_bytes()
+
+
+def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> None:
+    env, run = trained
+    other = "worlds:Endless"
+    for more, message in (
+        ({"hidden": "8,9"}, "hidden is 8,8 in .*, and 8,9 here"),
+        ({"activation": "relu"}, "activation is tanh in .*, and relu here"),
+        ({"trunk": "shared"}, "trunk is separate in .*, and shared here"),
+        ({"normalize_observations": False}, "normalize_observations is True in .*, and False"),
+        ({"init_from": str(tmp_path)}, "is no run, and no RUN/ARM/SEED of one"),
+        ({"init_from": f"{run}/ppo/7"}, "member: unknown member 'ppo/7'"),
+    ):
+        settings = {**SETTINGS, "init_from": str(run), **more}
+        with pytest.raises(BadInput, match=message):
+            sauna.train(env, out=tmp_path / "new", quiet=True, **settings)
+    if env.startswith("worlds"):
+        with pytest.raises(BadInput, match=f"has other spaces than {other}: "):
+            sauna.train(other, out=tmp_path / "new", quiet=True, init_from=str(run), **SETTINGS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_foreign_run_is_refused_until_it_is_trusted(trained, tmp_path, monkeypatch) -> None:
+    env, run = trained
+    monkeypatch.setenv("SAUNA_KEY_FILE", str(tmp_path / "another"))
+    with pytest.raises(BadInput, match="not known to be yours"):
+        initial(env, run)
+    overrides = {"env": env, **SETTINGS, "init_from": str(run)}
+    assert read_initial(prepare(overrides), print, trust=True)
+
+
+def test_a_path_names_a_run_or_a_member_of_it(tmp_path: Path) -> None:
+    (tmp_path / "config.json").touch()
+    for text, member, best in (
+        ("", "", False),
+        ("/ppo/0", "ppo/0", False),
+        ("/best", "", True),
+        ("/sauna+avec/3/best", "sauna+avec/3", True),
+    ):
+        source = Source(f"{tmp_path}{text}")
+        assert (source.run, source.member, source.best) == (tmp_path, member, best)
+
+
+def test_a_member_starts_from_the_one_named_the_only_one_or_its_namesake() -> None:
+    member = Member("sauna/3", "sauna", 3, dataclasses.replace(Config()))
+    assert _source_of(member, ["ppo/0", "ppo/3"], "ppo/0") == "ppo/0"
+    assert _source_of(member, ["ppo/0"], "") == "ppo/0"
+    assert _source_of(member, ["ppo/0", "ppo/3"], "") == "ppo/3"
+    assert _source_of(member, ["ppo/3", "sauna/3"], "") == "sauna/3"
+    with pytest.raises(BadInput, match=r"no member ppo/3 for sauna/3; name one: RUN/ppo/0"):
+        _source_of(member, ["ppo/0", "ppo/1"], "")
