@@ -143,7 +143,7 @@ def _with_colon(env: str) -> str:
     if not name.isidentifier() or not all(part.isidentifier() for part in parts):
         return ""
     is_here = Path(f"{parts[0]}.py").is_file() or Path(parts[0]).is_dir()
-    if not is_here and importlib.util.find_spec(parts[0]) is None:
+    if not is_here and not (parts[0] in sys.modules or importlib.util.find_spec(parts[0])):
         return ""
     return f"; a class or function of a module is written '{module}:{name}'"
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.shapes import check_shapes
+from sauna.envs.shapes import shape_check
 from sauna.system.errors import BadInput
 
 SMALLEST_IMAGE = 36  # the Nature CNN's three convolutions need this many pixels
@@ -210,8 +210,10 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     if isinstance(space, gym.Box) and len(space.shape) == 1:
         return np.asarray
 
+    check = shape_check(space)
+
     def read(observation: Any) -> np.ndarray:
-        check_shapes(space, observation)
+        check(observation)
         if isinstance(space, gym.Box):
             return np.asarray(observation).reshape(-1)
         return gym.flatten(space, observation)
