@@ -89,7 +89,7 @@ def test_a_batch_gives_the_actions_of_its_observations(run: Path) -> None:
     assert drawn[0].shape == policy(many).shape and not np.array_equal(*drawn)
     again = sauna.load(run)
     again.predict(many[0], deterministic=True)  # counts as a call
-    np.testing.assert_array_equal(again.predict(many)[0], drawn[1])
+    np.testing.assert_array_equal(again.predict(many)[0], drawn[0])
     for wrong in (np.ones(4), np.ones((1, 20)), {"goal": np.ones(3)}, np.ones((0, 3))):
         with pytest.raises(BadInput, match=r"expected \(3,\), one observation or a batch|is empty"):
             policy(wrong)
