@@ -127,8 +127,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
-    text = f"what to compare, also module:name of a rule of your own (default {arms}); the first is"
-    text += " the baseline"
+    text = f"what to compare, also your module:rule; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
     text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
     compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
@@ -266,8 +265,9 @@ def _train(values: dict[str, Any]) -> None:
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
     """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
-    replaced = {"seed": "seeds", "batch_size": "minibatches"}
+    replaced = {"seed": "seeds", "batch_size": "minibatches", "target_kl": "stop"}
     gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
+    gone += ["stop_kwargs"] * ("stop" in gone)
     return {k: v for k, v in stored.items() if k not in gone} | typed
 
 

@@ -56,6 +56,7 @@ def test_a_stop_is_in_the_checkpoint_at_the_end_of_the_same_iteration(tmp_path: 
     """A run that is killed right after it goes on without that member, also without callback."""
     run = tmp_path / "run"
     settings = {**SETTINGS, "seeds": 2, "checkpoint_every": 2, "keep_checkpoints": 9}
+    settings["processes"] = 2  # of which one ends early
 
     def stop(row: dict[str, Any]) -> bool:
         return row["member"] == "ppo/0" and row["iteration"] >= 1

@@ -72,7 +72,7 @@ def test_more_steps_are_stored_and_the_run_is_not_complete_any_more(finished, ca
 
 def test_restarted_schedules_begin_where_the_run_had_ended(finished, capsys) -> None:
     assert reopened(finished, restart_schedule=True).config.schedule_start == 192
-    assert "learning_rate_schedule: anew from here" in capsys.readouterr().out
+    assert "learning_rate_schedule: anew from 192 to 384" in capsys.readouterr().out
 
 
 def test_what_cannot_be_extended_says_why_and_changes_nothing(finished: Path) -> None:

@@ -34,8 +34,7 @@ def add_fields(
         group = parser.add_argument_group(f"{title}{_of_preset(title, values)}")
         for name in members:
             _add_field(group, name, values[name])
-        if title == FIRST:
-            _add_accepted(group, chosen)
+        _add_accepted(group, members)
 
 
 def lists_settings(names: Iterable[str]) -> Callable[[F], F]:
@@ -78,14 +77,17 @@ def _add_field(group: Any, name: str, value: Any) -> None:
 
 
 def _add_accepted(group: Any, chosen: list[str]) -> None:
-    """Adds the flags that stand for a field; see `other_names.translate`."""
+    """Adds the flags that stand for one of the fields `chosen`; see `accepted.translate`."""
+    batch = "samples per minibatch, in place of --minibatches"
+    kl = "stop an iteration whose KL divergence exceeds 1.5 times this, in place of --stop"
     texts = {
-        "seeds": ("seed", "this one seed, in place of --seeds"),
-        "minibatches": ("batch_size", "samples per minibatch, in place of --minibatches"),
+        "seeds": ("seed", "INT", "this one seed, in place of --seeds"),
+        "rollout_steps": ("batch_size", "INT", batch),
+        "stop": ("target_kl", "FLOAT", kl),
     }
-    for ours, (name, text) in texts.items():
+    for ours, (name, kind, text) in texts.items():
         if ours in chosen:
-            group.add_argument(flag(name), default=argparse.SUPPRESS, help=text, metavar="INT")
+            group.add_argument(flag(name), default=argparse.SUPPRESS, help=text, metavar=kind)
 
 
 def metavar(name: str) -> str:

@@ -1,8 +1,8 @@
 """What other trainers call a setting, and what it is called here.
 
-Of Stable-Baselines3, CleanRL, rsl_rl and Brax. `seed` and `batch_size` are accepted as they are
-(see `accepted.py`); another name is answered with the one that means the same, as the values may
-count otherwise.
+Of Stable-Baselines3, CleanRL, rsl_rl and Brax. `seed`, `batch_size` and `target_kl` are accepted
+as they are (see `accepted.py`); another name is answered with the one that means the same, as the
+values may count otherwise.
 """
 
 from __future__ import annotations
@@ -38,6 +38,11 @@ SAME = {
     "lr_schedule": "learning_rate_schedule",
     "anneal_lr": "learning_rate_schedule",
     "schedule": "learning_rate_schedule",
+    "kl_threshold": "desired_kl",
+    "min_lr": "learning_rate_min",
+    "max_lr": "learning_rate_max",
+    "optimizer_class": "optimizer",
+    "warmup_steps": "warmup",
     "clip_coef": "clip_range",
     "clip_param": "clip_range",
     "clipping_epsilon": "clip_range",
@@ -73,9 +78,12 @@ SAME = {
     "clip_reward": "clip_rewards",
     "episode_length": "env_kwargs",
     "action_repeat": "env_kwargs",
-    "tensorboard_log": "tensorboard",
-    "track": "tensorboard",
-    "wandb_project_name": "tensorboard",
+    "tensorboard": "track",
+    "tensorboard_log": "track",
+    "logger": "track",
+    "wandb": "track",
+    "wandb_project": "track_project",
+    "wandb_project_name": "track_project",
     "save_interval": "checkpoint_every",
     "save_freq": "checkpoint_every",
     "exp_name": "out",
@@ -92,8 +100,6 @@ SAME = {
     "n_seeds": "seeds",
 }
 ADVICE = {
-    "target_kl": "`--stop target-kl` stops an iteration by its KL divergence",
-    "desired_kl": "there is no step size by KL divergence here; see learning_rate_schedule",
     "max_iterations": "give steps: iterations x envs x rollout_steps",
     "num_iterations": "give steps: iterations x envs x rollout_steps",
     "capture_video": "`sauna eval RUN --video` records a trained policy",
@@ -103,7 +109,7 @@ ADVICE = {
     "use_sde": "there is no state-dependent exploration here",
     "policy": "the policy follows from the spaces; `network` chooses its trunk",
 }
-ACCEPTED = ("seed", "batch_size")
+ACCEPTED = ("seed", "batch_size", "target_kl")
 
 
 def key_hint(name: str) -> str:

@@ -9,8 +9,8 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from sauna.config.options import FILTERS as FILTERS
-from sauna.config.options import VEX_TARGETS as VEX_TARGETS
+from sauna.config.choices import FILTERS as FILTERS
+from sauna.config.choices import VEX_TARGETS as VEX_TARGETS
 from sauna.config.options import Config as Config
 from sauna.config.parsing import read_value
 from sauna.system.errors import BadInput, nearest

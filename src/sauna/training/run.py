@@ -45,7 +45,7 @@ from sauna.training.prepare import (
     examine,
     place,
 )
-from sauna.training.tensorboard import TensorBoard
+from sauna.training.tracking.trackers import check_trackers
 
 
 class Run:
@@ -116,7 +116,7 @@ def start(
         placed = place(resolve_run(overrides))
         check_writes(placed.config)
         prepared = examine(placed, overrides, found)
-        TensorBoard.check(prepared.config)
+        check_trackers(prepared.config)
         check_own_parts(prepared)
         initial = read_initial(prepared, display.say, trust)
     path, made = _make_directory(prepared.config)
@@ -245,7 +245,7 @@ def reopen(
     changed = before.replace(**parsed)
     check_extension(before.config, changed.config)
     check_consistent(changed.config)
-    TensorBoard.check(changed.config)
+    check_trackers(changed.config)
     changed = place(changed)
     check_writes(changed.config)
     if (changed.config.backend == "device") != (before.config.backend == "device"):

@@ -31,21 +31,22 @@ class FrozenPolicy:
         self.config = config
         self._space = env.observation_space
         self._read = observation_reader(env.observation_space)
-        self._write = action_writer(env.action_space, config.rescale_actions)
+        self.write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
-        self._policy: Policy = make_policy(config, spaces)
-        self._params: Any = None
+        self.policy: Policy = make_policy(config, spaces)
+        self.params: Any = None
         self._moments: Moments | None = None
         self._act = jax.jit(self._choose, static_argnames="deterministic")
         self._predict = jax.jit(self._heads)
+        self._log_prob = jax.jit(self._likelihood)
 
     def load(self, params: Array, moments: Moments | None) -> None:
         """Takes over parameters `[D]` and moments of `[obs]`; None: nothing is normalised."""
-        self._params, self._moments = jax.numpy.asarray(params), moments
+        self.params, self._moments = jax.numpy.asarray(params), moments
 
     def _choose(self, params: Array, observation: Any, key: Any, *, deterministic: bool) -> Any:
-        distribution = self._policy.distribution
-        parameters = self._policy.apply(params, observation).policy
+        distribution = self.policy.distribution
+        parameters = self.policy.apply(params, observation).policy
         if deterministic:
             return distribution.mode(parameters)
         return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
@@ -60,15 +61,23 @@ class FrozenPolicy:
         Raises:
           BadInput: `observation` is not of the environment's space.
         """
+        rows, is_batch = self._rows(observation)
+        actions = self._choices(rows, deterministic, key)
+        if is_batch:
+            return np.stack([np.asarray(self.write(action)) for action in actions])
+        return self.write(actions[0])
+
+    def act(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> np.ndarray:
+        """What the network chooses for one raw observation `[A]`, neither clipped nor stretched."""
+        return self._choices(self._read(observation)[None], deterministic, key)[0]
+
+    def _choices(self, rows: np.ndarray, deterministic: bool, key: Any) -> np.ndarray:
+        """What the network chooses for raw observations `[n, *obs]`: `[n, A]`."""
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
         key = jax.random.key(0) if key is None else key
-        rows, is_batch = self._rows(observation)
         seen = self._seen(rows)
-        actions = np.asarray(self._act(self._params, seen, key, deterministic=deterministic))
-        if is_batch:
-            return np.stack([np.asarray(self._write(action)) for action in actions])
-        return self._write(actions[0])
+        return np.asarray(self._act(self.params, seen, key, deterministic=deterministic))
 
     def _rows(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Raw observations as arrays `[n, *obs]`, and whether they came as a batch."""
@@ -94,5 +103,9 @@ class FrozenPolicy:
         return rows.astype(self._dtype)
 
     def _heads(self, params: Array, observation: Any) -> Any:
-        output = self._policy.apply(params, observation)
+        output = self.policy.apply(params, observation)
         return output.value, output.vex
+
+    def _likelihood(self, params: Array, observation: Any, action: Any) -> Any:
+        output = self.policy.apply(params, observation)
+        return self.policy.distribution.log_prob(output.policy, action)

@@ -111,7 +111,7 @@ def evaluate(
         check_drawn(result["env"], kwargs)
     made = make_env(result["env"], kwargs)
     check_spaces(artifact, made)
-    from sauna.algorithm.rollout.play import play  # imports JAX, so after the checks
+    from sauna.algorithm.rollout.play import play, success_rate  # imports JAX: after the checks
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
     for name in chosen:
@@ -121,7 +121,7 @@ def evaluate(
             progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
             for i in range(episodes)
         ]
-        result["members"][name] = statistics(played)
+        result["members"][name] = statistics(played) | success_rate(played)
         progress.say_cut(max_steps)
     close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
@@ -194,5 +194,6 @@ def report(result: dict[str, Any]) -> list[str]:
             f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
             f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
             f"{row['episodes']} episodes"
+            + (f", success {row['success_rate']:.0%}" if "success_rate" in row else "")
         )
     return lines
