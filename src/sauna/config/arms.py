@@ -27,7 +27,7 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 
 # A rule that ranks by |A| or by its sign leaves advantages whose mean is not 0: they are
-# standardised over the rollout before the choice, so that the rule turns no sign round.
+# standardised over the rollout before the choice, so that no advantage changes its sign.
 _PPO = {"filter": "none", "vex_coef": 0.0}
 _OVER_ROLLOUT = {**_PPO, "normalize_over": "rollout"}
 ARMS |= {

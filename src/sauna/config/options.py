@@ -204,7 +204,7 @@ class Config(RunOptions):
     selection_mode: str = _selection(
         "fewer",
         "fewer gradient steps on minibatches of PPO's size (or as near below it as fills them), as "
-        "many steps on smaller ones, or as many of PPO's size, refilled with what was taken",
+        "many steps on smaller ones, or as many of PPO's size, which repeat the chosen rows",
         choices=("fewer", "smaller", "refill"),
         read_when=readers.MASKED,
     )
