@@ -1,4 +1,7 @@
-"""Row 10: disk full, read-only or broken at any write: said clearly, nothing lost or pruned."""
+"""Row 10: disk full, read-only or broken at any write: said clearly, nothing lost or pruned.
+
+A write of `metrics.csv`, which follows from the logs, is said and ends no training.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import random
 import shutil
 import time
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -16,7 +20,7 @@ from faults.disk import Op, tree_of, watched
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
 from sauna import cli
-from sauna.system import checkpoint
+from sauna.system import checkpoint, metrics_csv, run_directory
 from sauna.system.errors import BadInput, SaunaError
 
 ERRORS = (errno.ENOSPC, errno.EROFS, errno.EIO)
@@ -52,14 +56,19 @@ def _fail_everywhere(
 def _fail(run: Path, world: str, at: int, number: int, expected: Ended, tally: Tally) -> None:
     shutil.rmtree(run, ignore_errors=True)
     trap = Trap(at, OSError(number, os.strerror(number), "the disk"))
-    clock = time.monotonic()
-    error = until(run, trap, world)
+    clock, said = time.monotonic(), []
+    with patch("sauna.api._Silent.say", lambda display, text: said.append(text)):
+        error = until(run, trap, world)
     tally.took(time.monotonic() - clock)
     tally.tried += 1
     op = trap.ops[at] if at < len(trap.ops) else None
     what = f"{errno.errorcode[number]} at operation {at} ({op.kind} {op.path})" if op else "none"
     tally.count(errno.errorcode[number])
-    if not isinstance(error, SaunaError) or os.strerror(number) not in str(error):
+    if op is not None and metrics_csv.NAME in op.path:
+        _check_table(
+            run, error, [text for text in said if os.strerror(number) in text], what, tally
+        )
+    elif not isinstance(error, SaunaError) or os.strerror(number) not in str(error):
         tally.miss(f"{what}: ended with {error!r}")
     elif isinstance(error, BadInput) and (run / "config.json").exists():
         tally.lose(f"{what}: reported as bad input: {error}")
@@ -71,6 +80,21 @@ def _fail(run: Path, world: str, at: int, number: int, expected: Ended, tally: T
         return
     if expected.differs(run):
         tally.miss(f"{what}: {expected.differs(run)}")
+
+
+def _check_table(
+    run: Path, error: BaseException | None, said: list[str], what: str, tally: Tally
+) -> None:
+    """The training went on, one line says why the table had to wait, and it is whole in the end."""
+    if len(said) != 1 or metrics_csv.NAME not in said[0]:
+        tally.miss(f"{what}: said {said}")
+    if error is not None or not run_directory.is_complete(run):
+        tally.lose(f"{what}: ended with {error!r}")
+        return
+    table = (run / metrics_csv.NAME).read_bytes()
+    metrics_csv.MetricsCsv(run, said.append)
+    if table != (run / metrics_csv.NAME).read_bytes():
+        tally.lose(f"{what}: the table is not what the logs say")
 
 
 def _check_kept(run: Path, trap: Trap, what: str, tally: Tally) -> None:
@@ -90,6 +114,21 @@ def test_every_failing_write_is_told_and_loses_nothing(tmp_path: Path) -> None:
     tally = Tally()
     _fail_everywhere("host", 30, random.Random(3), tmp_path, tally)
     assert_held(tally.result(), 30)
+
+
+def test_a_table_that_cannot_be_written_ends_no_training(tmp_path: Path) -> None:
+    """Each of its writes, of which the sample above may hold none."""
+    tally = Tally()
+    world = BACKENDS["host"]
+    with played_back(record(world)):
+        whole = Trap()
+        until(tmp_path / "whole", whole, world)
+        expected = Ended(tmp_path / "whole")
+        at = [n for n, op in enumerate(whole.ops) if metrics_csv.NAME in op.path]
+        for n in at:
+            _fail(tmp_path / "run", world, n, errno.ENOSPC, expected, tally)
+    assert {whole.ops[n].kind for n in at} >= {"create", "write", "fsync", "rename"}
+    assert_held(tally.result(), len(at))
 
 
 def test_an_evaluation_that_cannot_be_written_is_one_line(tmp_path: Path, capsys) -> None:

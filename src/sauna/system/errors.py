@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import sys
 from collections.abc import Iterable
 
 
@@ -43,3 +45,9 @@ def one_line(error: BaseException) -> str:
 def printable(text: str) -> str:
     """A text in one line, without characters that a terminal would act on."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def warn(text: str) -> None:
+    """Prints `warning: TEXT` to standard error, if anybody is there to read it."""
+    with contextlib.suppress(OSError, ValueError):  # ValueError: it is closed
+        print(f"warning: {text}", file=sys.stderr, flush=True)

@@ -16,7 +16,7 @@ from typing import Any
 from sauna.system.checkpoint import BadCheckpoint, NewerFormat, numbered, read_manifest
 from sauna.system.errors import SaunaError
 from sauna.system.safe_read import Untrusted, open_file
-from sauna.system.safe_write import check_own, open_grown
+from sauna.system.safe_write import check_own, open_grown, sync_folder
 
 NAMES = ("metrics.jsonl", "timing.jsonl")
 LINE_BYTES = 2**24  # a row has some thousand, but for very many episodes
@@ -50,9 +50,7 @@ class Logs:
         """What a checkpoint's manifest says of the logs, all of them flushed to disk."""
         there = [name for name in NAMES if (self._run / name).exists()]
         for name in there:
-            descriptor = os.open(self._run / name, os.O_RDONLY)
-            os.fsync(descriptor)
-            os.close(descriptor)
+            sync_folder(self._run / name)
         digests = {name: self._digests[name].hexdigest() for name in there}
         return {"logs": {name: self._sizes[name] for name in there}, "log_digests": digests}
 

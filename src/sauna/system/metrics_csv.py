@@ -3,20 +3,24 @@
 It follows from the two logs alone: the keys of `metrics.jsonl` that hold no list, in the order in
 which they first appear, and `wall_seconds` of `timing.jsonl`. So it is written anew where a key
 appears for the first time and where a run is resumed; in between, rows are added to its end.
+
+A disk that does not take it ends no training: one line says so, and it is made anew at the end.
 """
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sauna.system.errors import one_line
 from sauna.system.logs import lines, read_row
+from sauna.system.safe_read import Untrusted
 from sauna.system.safe_write import open_grown, replacing, sync_folder
 
 NAME = "metrics.csv"
@@ -29,29 +33,52 @@ class MetricsCsv:
 
     Args:
       run: its logs are what a checkpoint counts on, and no more.
+      say: takes a line for each time that the table cannot be written.
     """
 
-    def __init__(self, run: Path) -> None:
-        self._run, self._columns = run, dict.fromkeys(_FIRST)
+    def __init__(self, run: Path, say: Callable[[str], None]) -> None:
+        self._run, self._say, self._columns = run, say, dict.fromkeys(_FIRST)
+        self._is_whole = True  # False: a row is missing, or half of one is there
         for row in _rows(run):
             self._columns |= dict.fromkeys(_cells(row))
-        self._write_anew()
+        self._try(self._write_anew, "the training goes on, and the table is made anew at its end")
 
     def append(self, rows: list[dict[str, Any]], wall_seconds: float | None) -> None:
         """Adds the rows of one iteration, which the logs have already."""
         cells = [_cells({**row, WALL: wall_seconds}) for row in rows]
         new = dict.fromkeys(itertools.chain(*cells)).keys() - self._columns.keys()
-        if new or not (self._run / NAME).exists():
-            for row in cells:
-                self._columns |= dict.fromkeys(row)
-            self._write_anew()
+        for row in cells:
+            self._columns |= dict.fromkeys(row)
+        if not self._is_whole:
             return
+        is_new = bool(new) or not (self._run / NAME).exists()
+        self._try(
+            self._write_anew if is_new else partial(self._add, cells),
+            "the training goes on, and the table is made anew at its end",
+        )
+
+    def finish(self) -> None:
+        """Flushes it to the disk, or makes it anew if a row could not be written before."""
+        if self._is_whole:
+            self._try(self._flush, "the table is made anew")
+        if not self._is_whole:
+            self._try(self._write_anew, "the run is whole: metrics.jsonl has every row")
+
+    def _try(self, act: Callable[[], None], then: str) -> None:
+        """Writes; what the disk, or a file in the table's place, says to that costs the table."""
+        try:
+            act()
+            self._is_whole = True
+        except (OSError, Untrusted) as error:
+            self._is_whole = False
+            self._say(f"warning: {NAME} cannot be written, {then}: {one_line(error)}")
+
+    def _add(self, cells: list[dict[str, Any]]) -> None:
         with open_grown(self._run / NAME) as file:
             file.write(self._text(cells))
 
-    def sync(self) -> None:
-        """Flushes it to the disk; one that fails now costs this table alone."""
-        with contextlib.suppress(OSError):
+    def _flush(self) -> None:
+        if (self._run / NAME).exists():  # a run without a row has none
             sync_folder(self._run / NAME)
 
     def _write_anew(self) -> None:

@@ -112,8 +112,8 @@ def write_durably(path: Path, data: bytes) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Flushes a folder's entries, or a file's bytes, to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Flushes a folder's entries, or a file's bytes, to the disk; waits for no FIFO."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         os.fsync(descriptor)
     finally:

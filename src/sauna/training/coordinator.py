@@ -22,7 +22,7 @@ import numpy as np
 from sauna.config.checks import local_parts
 from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
-from sauna.system.errors import BadInput, Interrupted, SaunaError
+from sauna.system.errors import BadInput, Interrupted, SaunaError, one_line, warn
 from sauna.system.logs import Logs, check_logs
 from sauna.system.metrics_csv import MetricsCsv, trained_seconds
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
@@ -76,7 +76,7 @@ class Coordinator:
         self._states: list[dict[int, dict[str, np.ndarray]]] = [{} for _ in self._parts]
         self._reached = [self._iteration] * len(self._parts)
         self._ended: list[int | None] = [None] * len(self._parts)
-        self._logs, self._csv = Logs(run.path), MetricsCsv(run.path)
+        self._logs, self._csv = Logs(run.path), MetricsCsv(run.path, display.say)
         self._clock = time.monotonic() - trained_seconds(run.path)
         self._due: list[tuple[int, dict[str, Any]]] = []  # checkpoints waiting for their states
         self._lead, self._granted = LEAD, 0
@@ -125,11 +125,14 @@ class Coordinator:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._watchdog.close()
-        for worker in self._workers:
-            worker.stop(0.0 if error[0] else 5.0)
-        self._trackers.close()
-        self._display.close()
+        """Ends all that was started; what fails in that hides neither an error nor a result."""
+        seconds = 0.0 if error[0] else 5.0
+        stops = [partial(worker.stop, seconds) for worker in self._workers]
+        for end in (self._watchdog.close, *stops, self._trackers.close, self._display.close):
+            try:
+                end()
+            except Exception as failure:
+                warn(f"the training has ended, but not all of it cleanly: {one_line(failure)}")
 
     def run(self) -> None:
         """Trains to the end, or to where a signal stops it.
@@ -350,7 +353,7 @@ class Coordinator:
         if self._trackers.urls:
             whole["tracking"] = self._trackers.urls
         run_directory.write_json(self._run.path / "summary.json", whole)
-        self._csv.sync()
+        self._csv.finish()
         self._trackers.summary(members, complete)
         self._display.summary(members)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -52,6 +53,26 @@ class Failing(Listed):
 class Closed(Listed):
     def close(self) -> None:
         raise OSError("gone")
+
+
+class Exits(Listed):
+    def row(self, row: Any) -> None:
+        raise SystemExit("please log in")
+
+
+class Nothing(Listed):
+    def open(self, run: sauna.TrackedRun) -> Any:
+        return None
+
+
+class BadUrls(Listed):
+    def open(self, run: sauna.TrackedRun) -> dict[str, Any]:
+        return {"urls": ["https://here/7"]}
+
+
+class Unwritable(Listed):
+    def open(self, run: sauna.TrackedRun) -> dict[str, Any]:
+        return {"key": self}
 
 
 class NotOpen(Listed):
@@ -115,7 +136,7 @@ def test_a_damaged_record_of_the_trackers_is_named(tmp_path: Path) -> None:
     (tmp_path / "tracking.json").write_text("{")
     trackers, said = opened(tmp_path, "Listed")
     trackers.rows(ROWS, CLOCK)
-    assert said[0].startswith("warning: config: cannot read") and "begin anew" in said[0]
+    assert said[0].startswith("warning: cannot read ") and "begin anew" in said[0]
     assert len(Listed.made[0].calls) == 2
 
 
@@ -191,3 +212,35 @@ def test_a_tracker_s_code_counts_as_code_that_a_run_names() -> None:
 def test_charts_get_numbers_over_env_steps() -> None:
     whole = {**row("ppo/0", 10), "kl": 0.5, "kept_steps": 9, "episode_returns": [1.0, 3.0]}
     assert scalars(whole) == {"kl": 0.5, "kept_steps": 9, "episode_return": 2.0}
+
+
+@pytest.mark.parametrize("name", ["Exits", "Nothing", "BadUrls", "Unwritable"])
+def test_a_tracker_that_keeps_to_no_rule_ends_alone(name: str, tmp_path: Path) -> None:
+    """It calls sys.exit, or returns what no `tracking.json` could hold."""
+    trackers, said = opened(tmp_path, f"{name},Listed")
+    trackers.rows(ROWS, CLOCK)
+    trackers.close()
+    assert f"{name} ended, the training goes on" in " ".join(said)
+    assert [call[0] for call in Listed.made[-1].calls] == ["row", "row", "close"]
+    assert f"{__name__}:Listed" in json.loads((tmp_path / "tracking.json").read_text())
+
+
+@pytest.mark.parametrize("plant", ["link", "fifo", "dangling", "no tracker's"])
+def test_what_is_planted_for_its_record_is_neither_followed_nor_waited_for(plant, tmp_path) -> None:
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    run.mkdir()
+    file = run / "tracking.json"
+    if plant == "fifo":
+        os.mkfifo(file)
+    elif plant == "no tracker's":
+        file.write_text(json.dumps({f"{__name__}:Listed": [7]}))
+    else:
+        file.symlink_to(victim)
+    if plant == "link":
+        victim.write_text("{}")
+    said = opened(run, "Listed")[1]
+    named = [line for line in said if line.startswith("warning: ") and "tracking.json" in line]
+    assert len(named) == (plant != "no tracker's")
+    assert Listed.made[0].run.before == {}
+    assert file.is_file() and not file.is_symlink()
+    assert (victim.read_text() if victim.exists() else None) == ("{}" if plant == "link" else None)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from sauna.config.presets import Member
 from sauna.config.settings import Config, to_json
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, nearest, one_line
+from sauna.system.safe_read import JSON_BYTES, Untrusted, parse_object, read_file
 from sauna.training.tracking.tracker import TrackedRun, Tracker
 
 # Name: the library that it needs, and its class.
@@ -21,6 +24,7 @@ KNOWN = {
     "trackio": ("trackio", "trackio:Trackio"),
     "mlflow": ("mlflow", "mlflow:MLflow"),
 }
+_FAILURES = (Exception, SystemExit)  # how a tracker may fail: some libraries call sys.exit
 FILE = "tracking.json"  # of the run directory: what each tracker needs to find its run again
 
 
@@ -103,19 +107,21 @@ class Trackers:
             return
         kept = self._kept()
         for name in names:
-            before = kept.get(name)
+            before = kept.get(name) if isinstance(kept.get(name), dict) else None
             self._done[name] = {} if before is None else self._before
             earlier = run_directory.rows(self._path) if before is None else []
             run = TrackedRun(self._path, self._config.track_project, self._members, before or {})
             try:
                 self._open[name] = tracker = _made(name)
-                kept[name] = tracker.open(run)
+                found = tracker.open(run)
+                urls = _urls(found)
+                kept[name] = found
                 for row in earlier:
                     tracker.row(row)
-            except Exception as error:  # a tracker fails in its own way
+            except _FAILURES as error:
                 self._end(name, error)
                 continue
-            if urls := kept[name].get("urls"):
+            if urls:
                 self.urls[name] = urls
                 self._say(f"{name}: {', '.join(dict.fromkeys(urls.values()))}")
         run_directory.write_json(self._path / FILE, kept)
@@ -124,9 +130,9 @@ class Trackers:
         """What the trackers of before have left, by which they find the run again."""
         file = self._path / FILE
         try:
-            return run_directory.read_config_file(file) if file.exists() else {}
-        except BadInput as error:
-            self._say(f"warning: {error}; trackers begin anew")
+            return parse_object(read_file(file, JSON_BYTES)) if os.path.lexists(file) else {}
+        except Untrusted as error:
+            self._say(f"warning: cannot read {file}: {error}; trackers begin anew")
             return {}
 
     def rows(self, rows: Sequence[Mapping[str, Any]], timing: Mapping[str, float]) -> None:
@@ -156,19 +162,34 @@ class Trackers:
     def _call(self, name: str, act: Callable[[Tracker], None]) -> None:
         try:
             act(self._open[name])
-        except Exception as error:  # a tracker fails in its own way
+        except _FAILURES as error:
             self._end(name, error)
 
-    def _end(self, name: str, error: Exception) -> None:
+    def _end(self, name: str, error: BaseException) -> None:
         self._say(f"warning: {name} ended, the training goes on: {one_line(error)}")
         tracker = self._open.pop(name, None)
         try:
             if tracker is not None:
                 tracker.close()
-        except Exception:  # it has failed already
+        except _FAILURES:  # it has failed already
             pass
 
 
 def _made(name: str) -> Tracker:
     found = _class_of(name)
     return found if isinstance(found, Tracker) else found()
+
+
+def _urls(kept: Any) -> dict[str, str]:
+    """Reads the addresses among what a tracker's `open` returned.
+
+    Raises:
+      TypeError, ValueError: that is nothing that `tracking.json` could hold.
+    """
+    if not isinstance(kept, dict):
+        raise TypeError(f"open returned {type(kept).__name__}, not a dict")
+    json.dumps(kept, allow_nan=False)
+    urls = kept.get("urls") or {}
+    if not isinstance(urls, dict) or not all(isinstance(url, str) for url in urls.values()):
+        raise TypeError("urls is no dict of a text for each member")
+    return urls
