@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -144,3 +145,10 @@ def test_an_unsupported_system_is_named_in_a_line(monkeypatch, capsys) -> None:
     said = capsys.readouterr().err
     assert exit.value.code == 1 and said.count("\n") == 1
     assert "Windows is not supported: SAUNA runs on Linux and macOS" in said
+
+
+def test_the_packages_page_names_the_supported_systems() -> None:
+    project = Path(__file__).parents[2] / "pyproject.toml"
+    named = tomllib.loads(project.read_text())["project"]["classifiers"]
+    systems = [name for name in named if name.startswith("Operating System")]
+    assert systems == ["Operating System :: MacOS", "Operating System :: POSIX :: Linux"]

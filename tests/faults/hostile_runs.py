@@ -226,6 +226,7 @@ def _artifacts() -> dict[str, Case]:
         "tables": [{}],
         "numbers": [0],
         "none": [],
+        "one twice": ["ppo/0", "ppo/0"],
         "of another run": ["../../etc/passwd"],
         "HTML": [HTML],
     }.items():

@@ -72,12 +72,9 @@ def _eval(run: Path) -> None:
     """What `sauna eval` does before it plays."""
     from sauna.envs.make import make_env
     from sauna.experiments.evaluate.policy import TrainedPolicy
-    from sauna.system.errors import BadInput
     from sauna.training.artifact import check_spaces, find_member, load_artifact
 
     artifact = load_artifact(run, lambda text: None)
-    if not artifact.members:
-        raise BadInput("no members")
     name = find_member(artifact.members, artifact.members[0])
     env = make_env(artifact.config.env, {})
     check_spaces(artifact, env)

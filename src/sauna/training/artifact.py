@@ -59,7 +59,10 @@ def load_artifact(
         spaces = read_spaces(loaded.manifest["spaces"])
     except (TypeError, ValueError, LookupError) as error:
         raise checkpoint.BadCheckpoint(f"{loaded.path}: its spaces cannot be read") from error
-    return Artifact(read_stored(loaded.manifest), spaces, loaded.manifest["members"], loaded)
+    members = loaded.manifest["members"]
+    if not members or len(set(members)) < len(members):
+        raise checkpoint.BadCheckpoint(f"{loaded.path}: its members are not named, each once")
+    return Artifact(read_stored(loaded.manifest), spaces, members, loaded)
 
 
 def _newest(run: Path, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:

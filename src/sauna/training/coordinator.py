@@ -128,7 +128,8 @@ class Coordinator:
         """Ends all that was started; what fails in that hides neither an error nor a result."""
         seconds = 0.0 if error[0] else 5.0
         stops = [partial(worker.stop, seconds) for worker in self._workers]
-        for end in (self._watchdog.close, *stops, self._trackers.close, self._display.close):
+        ends: list[Callable[[], None]] = [self._watchdog.close, *stops]
+        for end in (*ends, self._trackers.close, self._display.close):
             try:
                 end()
             except Exception as failure:

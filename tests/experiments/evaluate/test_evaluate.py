@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -10,6 +12,7 @@ import pytest
 
 import sauna
 import worlds
+from faults.hostile_runs import change_manifest
 from helpers import SMALL
 from sauna import cli
 from sauna.config.plugins import name_of
@@ -18,6 +21,7 @@ from sauna.experiments.evaluate.episodes import VideoFailure, kwargs_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import check_drawn, frame, frames_per_second, video
 from sauna.system import run_directory
+from sauna.system.checkpoint import numbered
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training.artifact import load_artifact
 
@@ -138,14 +142,19 @@ def test_frames_of_odd_sides_and_without_a_rate_become_a_video(endless: Path) ->
     assert [path.name for path in (endless / "videos").iterdir()] == ["ppo-0_sampled_3.mp4"]
 
 
-def test_frames_go_to_the_encoder_one_by_one(tmp_path: Path) -> None:
-    """Its process has them before the video is complete."""
-    sizes = []
+def test_frames_go_to_the_encoder_one_by_one(tmp_path: Path, monkeypatch) -> None:
+    """It has each of them before the next one is drawn."""
+    seen: list[int] = []
+
+    class Encoder(contextlib.nullcontext):
+        def append_data(self, picture: np.ndarray) -> None:
+            seen.append(int(picture[0, 0, 0]))
+
+    monkeypatch.setattr("imageio.v2.get_writer", lambda path, **chosen: Encoder())
     with video(tmp_path / "a.mp4", 30.0) as add:
-        for _ in range(120):
-            add(np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8))
-    sizes.append((tmp_path / "a.mp4").stat().st_size)
-    assert sizes[-1] > 1000
+        for k in range(5):
+            add(np.full((4, 4, 3), k, np.uint8))
+            assert seen == [*range(k + 1)]
 
 
 def test_a_failing_video_keeps_the_returns(endless: Path, capsys) -> None:
@@ -209,3 +218,19 @@ def test_a_run_of_parts_is_trained_and_played(tmp_path: Path) -> None:
     assert run_directory.read_config(run.path)["spaces"][:2] == ["vector", [9]]
     assert sauna.evaluate(run.path, episodes=1)["members"]["ppo/0"]["lengths"] == [4]
     assert episodes.MAX_STEPS == 30_000
+
+
+@pytest.mark.parametrize("members", [[], ["ppo/0", "ppo/0"]])
+def test_a_run_whose_members_were_tampered_with_is_refused(
+    members: list[str], endless: Path, tmp_path: Path, capsys
+) -> None:
+    """Not evaluated to nothing, with exit 0."""
+    run = tmp_path / "run"
+    shutil.copytree(endless, run)
+    for path in numbered(run / "checkpoints"):
+        change_manifest(run, lambda manifest: {**manifest, "members": members}, path.name)
+    for command in ("eval", "inspect"):
+        with pytest.raises(SystemExit) as exit:
+            cli.main([command, str(run), "--episodes", "1", "--max-steps", "3"])
+        said = capsys.readouterr().err
+        assert exit.value.code == 1 and said.endswith("its members are not named, each once\n")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from sauna.algorithm.rollout.play import play
+from sauna.envs.host.answers import close
 from sauna.envs.make import make_drawn_env, make_env
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import choose_renderer, not_drawn
@@ -57,7 +58,7 @@ def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]
         episodes.append(
             {"return": played[0], "length": played[1], "upright": float(upright.mean())}
         )
-    env.close()
+    close(env)
     share = float(seen.mean())
     shown = clearest([episode["upright"] for episode in episodes], share)
     return {
