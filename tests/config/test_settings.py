@@ -35,6 +35,7 @@ def test_a_field_that_nothing_reads_is_refused_with_what_would_read_it(name: str
         normalize_observations=False,
         normalize_rewards=False,
         normalize_advantages=False,
+        learning_rate_schedule="constant",
     )
     needed = FIELDS[name].metadata["read_when"][0]
     assert not is_read(name, unread)
