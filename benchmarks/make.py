@@ -164,6 +164,22 @@ def scale_table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def saved_table(result: dict[str, Any]) -> str:
+    """An update's time at each kept share, of that of PPO's."""
+    cases = {name: one for name, one in result.items() if "ratio" in one}
+    shares = list(next(iter(cases.values()))["ratio"])
+    bounds = next(iter(cases.values()))["bound"]
+    lines = [f"| kept share | {' | '.join(shares)} |", "|---|" + "---|" * len(shares)]
+    for name, one in cases.items():
+        lines.append(f"| {name} | {_row(one['ratio'])} |")
+    lines.append(f"| bound: 1.15 k + 0.05 | {_row(bounds)} |")
+    return "\n".join(lines)
+
+
+def _row(values: dict[str, float]) -> str:
+    return " | ".join(f"{value:.2f}" for value in values.values())
+
+
 def insert(path: Path, name: str, text: str) -> None:
     """Puts `text` between the markers `NAME` of a Markdown file."""
     begin, end = f"<!-- {name} begin -->", f"<!-- {name} end -->"
@@ -187,6 +203,7 @@ def main() -> None:
     filtered = RESULTS / "filtered.json"
     if filtered.exists():
         insert(page, "filtered", filtered_table(json.loads(filtered.read_text())))
+    insert(page, "saved", saved_table(json.loads((RESULTS / "selection.json").read_text())))
     scaled = RESULTS / "scale.json"
     if scaled.exists():
         result = json.loads(scaled.read_text())

@@ -86,3 +86,23 @@ def far(limit: float = 0.5) -> StopRule:
 
 each = StopRule(lambda log_ratio, weight: log_ratio > 0.5)
 amount = StopRule(lambda log_ratio, weight: jnp.max(log_ratio))
+
+
+def robust(error: jax.Array, weight: jax.Array) -> jax.Array:
+    """The mean of `log cosh` of the errors: large ones count as their size."""
+    loss = jnp.logaddexp(error, -error) - jnp.log(2.0)
+    return jnp.sum(loss * weight) / jnp.maximum(jnp.sum(weight), 1.0)
+
+
+def one_sided(log_ratio: jax.Array, advantage: jax.Array, clip_range: jax.Array) -> jax.Array:
+    """PPO's term with the clip above alone."""
+    ratio = jnp.exp(log_ratio)
+    return -advantage * jnp.minimum(ratio, 1.0 + clip_range)
+
+
+def each_error(error: jax.Array, weight: jax.Array) -> jax.Array:
+    return error**2 * weight
+
+
+def averaged(log_ratio: jax.Array, advantage: jax.Array, clip_range: jax.Array) -> jax.Array:
+    return -jnp.mean(advantage * jnp.exp(log_ratio))

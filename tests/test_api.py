@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -13,7 +15,7 @@ import pytest
 
 import sauna
 from command_line import sauna_here
-from helpers import SMALL, own
+from helpers import SMALL, environment, own
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.report.curve import interval, member_curves
 from sauna.system import run_directory
@@ -24,6 +26,31 @@ from worlds import Finite, Scripted
 ROOT = Path(__file__).parent.parent
 
 
+class Listed(sauna.Tracker):
+    """A tracker of the user's own, which keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple] = []
+
+    def open(self, run: sauna.TrackedRun) -> dict:
+        return {"urls": dict.fromkeys(run.members, "https://here")}
+
+    def row(self, row) -> None:
+        self.calls.append(("row", row["member"], row["env_steps"]))
+
+    def picture(self, name: str, path: Path) -> None:
+        self.calls.append(("picture", name, path))
+
+    def summary(self, members, complete: bool) -> None:
+        self.calls.append(("summary", members, complete))
+
+    def close(self) -> None:
+        self.calls.append(("close",))
+
+
+LISTED = Listed()
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     run = tmp_path_factory.mktemp("api") / "run"
@@ -31,7 +58,7 @@ def result(tmp_path_factory):
         "worlds:Scripted",
         quiet=True,
         out=run,
-        tensorboard=True,
+        track=["tensorboard", LISTED],
         **{**SMALL, "arm": "sauna", "seeds": 2},
     )
 
@@ -64,6 +91,7 @@ def test_rows_hold_every_metric(result) -> None:
         "kl",
         "clip_fraction",
         "gradient_norm",
+        "policy_std",
         "explained_variance",
         "vex_target",
         "vex_mean",
@@ -95,6 +123,8 @@ def test_the_policy_acts_as_in_training(result) -> None:
     observation, _ = world.reset(seed=3)
     arrays = own(artifact.checkpoint.arrays, "sauna/1")
     arrays = {name.removeprefix("/"): value for name, value in arrays.items()}
+    last = [row for row in result.metrics if row["member"] == "sauna/1"][-1]
+    assert last["policy_std"] == pytest.approx(np.exp(arrays["params/log_std"]).mean(), rel=1e-6)
     mean, variance = arrays["observation_moments/mean"], arrays["observation_moments/variance"]
     x = np.clip((observation - mean) / np.sqrt(variance + 1e-8), -10, 10)
     for layer in ("policy_trunk/layer_0", "policy_trunk/layer_1"):
@@ -146,6 +176,68 @@ def test_tensorboard_holds_the_same_numbers(result) -> None:
         np.testing.assert_allclose(found[name], [row[name] for row in rows], rtol=1e-6)
 
 
+def test_a_tracker_of_one_s_own_gets_all_and_the_summary_says_where(result) -> None:
+    rows = [call[1:] for call in LISTED.calls if call[0] == "row"]
+    assert rows == [(row["member"], row["env_steps"]) for row in result.metrics]
+    others = [call for call in LISTED.calls if call[0] != "row"]
+    assert others == [
+        ("summary", result.summary, True),
+        ("picture", "learning_curve", result.path / "figures" / "learning_curve.png"),
+        ("close",),
+    ]
+    (urls,) = run_directory.read_config_file(result.path / "summary.json")["tracking"].values()
+    assert urls == {"sauna/0": "https://here", "sauna/1": "https://here"}
+
+
+def test_a_result_is_a_figure_and_a_table(result, monkeypatch) -> None:
+    figure = result.plot()
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    lines = [line.get_ydata() for line in figure.axes[0].lines]
+    means = [row["return_mean"] for row in result.metrics if row["member"] == "sauna/1"]
+    assert any(np.array_equal(line, means) for line in lines)
+    monkeypatch.setitem(sys.modules, "pandas", None)  # as if it were not installed
+    assert result.table("metrics") == result.metrics
+    expected = [{"member": name, **numbers} for name, numbers in result.summary.items()]
+    assert result.table() == expected
+    with pytest.raises(BadInput, match="'members' or 'metrics'"):
+        result.table("rows")
+
+
+def test_a_table_is_a_data_frame_if_pandas_is_there(result) -> None:
+    pandas = pytest.importorskip("pandas")
+    table = result.table()
+    assert isinstance(table, pandas.DataFrame)
+    assert table.to_dict("records") == [{"member": n, **x} for n, x in result.summary.items()]
+
+
+SCRIPT = """
+import sauna
+
+with open("times.txt", "a") as file:
+    file.write("run\\n")
+result = sauna.train("worlds:Scripted", quiet=True, out="run", arm="ppo", processes=2, {settings})
+print(len(result.metrics), result.table().shape if hasattr(result.table(), "shape") else "")
+"""
+
+
+@pytest.mark.slow
+def test_a_script_needs_no_main_guard(tmp_path) -> None:
+    """Two training processes, each with a process of environments; the script runs once."""
+    settings = {**SMALL, "seeds": 2, "env_processes": 1}
+    text = ", ".join(f"{name}={value!r}" for name, value in settings.items())
+    (tmp_path / "script.py").write_text(SCRIPT.format(settings=text))
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("8 ")
+    assert (tmp_path / "times.txt").read_text() == "run\n"
+
+
 @pytest.mark.processes
 def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
     named = sauna.train(Scripted, quiet=True, out=tmp_path / "named", **SMALL)
@@ -176,8 +268,12 @@ def test_videos_are_written_and_read_back(tmp_path) -> None:
 
 
 def test_no_video_is_said_plainly(result) -> None:
-    with pytest.raises(sauna.SaunaError, match=r"video: .*drawn here|env: .*cannot be made"):
-        sauna.evaluate(result.path, episodes=1, video=True)
+    """Before an episode is played."""
+    said: list[str] = []
+    needs = r"video: a video needs an environment that takes render_mode='rgb_array'"
+    with pytest.raises(sauna.BadInput, match=needs):
+        sauna.evaluate(result.path, episodes=1, max_steps=1, video=True, say=said.append)
+    assert said == []
 
 
 def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_path) -> None:

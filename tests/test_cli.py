@@ -84,11 +84,16 @@ BAD = [
     (["train", WORLD, "--num_envs=4"], "here it is '--envs': environments per member"),
     (["train", WORLD, "--lr", "1e-3"], "here it is '--learning-rate'"),
     (["train", WORLD, "--total-timesteps", "1e6"], "here it is '--steps'"),
-    (["train", WORLD, "--target-kl", "0.01"], "`--stop target-kl` stops an iteration"),
     (["train", WORLD, "--batch-size", "100"], "batch_size: 100 does not divide"),
     (["train", WORLD, "--batch-size", "0"], "batch_size: 0 does not divide"),
     (["train", WORLD, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
     (["train", WORLD, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
+    (["train", WORLD, "--target-kl", "0"], "target_kl: must be a number above 0"),
+    (["train", WORLD, "--target-kl", "x"], "target_kl: cannot read 'x' as float"),
+    (["train", WORLD, "--target-kl", "0.01", "--stop", "espo"], "either target_kl or stop"),
+    (["train", WORLD, "--target-kl", "0.01", "--algorithm", "a2c"], "stop: not read"),
+    (["train", WORLD, "--optimizer", "adamv"], "did you mean 'adam'"),
+    (["train", WORLD, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),
     (["train", WORLD, "--seeds", "1.5"], "seeds: cannot read '1.5' as whole numbers, separated by"),
     (["train", WORLD, "--env-kwargs", "[1]"], "cannot read '[1]' as a JSON object, such as '{"),
     (["train", WORLD, "--lr-schedule", "x"], "here it is '--learning-rate-schedule'"),
@@ -261,6 +266,8 @@ def test_compare_says_its_own_defaults() -> None:
 def test_one_seed_and_samples_per_minibatch() -> None:
     assert translate({"seed": "7"}) == {"seeds": (7,)}
     assert translate({"batch_size": 64}) == {"minibatches": 32}
+    by_kl = translate({"target_kl": 0.01, "stop_kwargs": {"factor": 1}})
+    assert by_kl == {"stop": "target-kl", "stop_kwargs": '{"factor": 1, "limit": 0.01}'}
     atari = {"preset": "atari", "envs": "16", "batch_size": "512"}
     assert translate(atari) == {"preset": "atari", "envs": "16", "minibatches": 4}
     assert translate({"seed": None, "gamma": 0.9}) == {"gamma": 0.9}

@@ -20,6 +20,8 @@ from sauna.system.errors import SaunaError
 from sauna.system.processes import start_thread
 from sauna.training import worker
 
+ONE_AT_A_TIME = threading.Lock()
+
 
 class _Lines:
     """A stream that hands on each line as a message."""
@@ -46,7 +48,8 @@ class UnitThread:
 
     def _run(self, settings: dict[str, Any], receive: Callable[[Any], None]) -> None:
         try:
-            unit_process.train(settings, {}, unit_process.LineDisplay(_Lines(receive)))  # type: ignore[arg-type]
+            with ONE_AT_A_TIME:  # Python 3.11 cannot parse code in two threads at once
+                unit_process.train(settings, {}, unit_process.LineDisplay(_Lines(receive)))  # type: ignore[arg-type]
         except SaunaError as error:
             receive({"error": str(error)})
         finally:

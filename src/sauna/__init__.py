@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
     from sauna.system.errors import BadInput, SaunaError
+    from sauna.training.tracking.tracker import TrackedRun, Tracker
 
 __version__ = "0.1.0"
 
@@ -43,6 +44,8 @@ __all__ = [
     "ScoredStep",
     "StepFilter",
     "StopRule",
+    "TrackedRun",
+    "Tracker",
     "Transition",
     "VexTarget",
     "compare",
@@ -63,6 +66,8 @@ _HOMES = {
     "train": "sauna.api",
     "JaxEnv": "sauna.envs.device.contract",
     "Transition": "sauna.envs.device.contract",
+    "TrackedRun": "sauna.training.tracking.tracker",
+    "Tracker": "sauna.training.tracking.tracker",
     "evaluate": "sauna.experiments.evaluate.episodes",
     "inspect": "sauna.experiments.inspect.command",
     **dict.fromkeys(
@@ -93,6 +98,11 @@ def __getattr__(name: str) -> Any:
     if _HOMES[name] != "sauna.system.errors":
         importlib.import_module("sauna.system.supported").check_system()
     return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Lists the public names too, which are not imported yet."""
+    return sorted({*globals(), *__all__})
 
 
 _register()

@@ -8,19 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.accepted import translate
+from sauna.config.flags import lists_settings
+from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
-from sauna.config.settings import fields_with
+from sauna.config.settings import FIELDS, fields_with
 from sauna.envs.make import check_makes, known_in_this_process_alone
-from sauna.experiments.report.curve import draw_curve
+from sauna.experiments.report.curve import curve_figure, draw_curve
 from sauna.system import run_directory
-from sauna.system.errors import BadInput, Interrupted
+from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
 from sauna.training.coordinator import Callback
 from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.pick import pick
 from sauna.training.train import train_run
 
+_OF_TRAIN = [name for name in FIELDS if name != "env"]
+_OF_COMPARE = [name for name in _OF_TRAIN if name not in (*fields_with("decided_by_study"), "arm")]
 PARTS = fields_with("plugin")  # what a user may pass by value
 
 
@@ -42,10 +46,14 @@ def _env_name(env: Any) -> str:
 
 
 class Result:
-    """A finished run: its directory, its numbers, its policies."""
+    """A finished run: its directory, its numbers, its figure, its policies.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Args:
+      path: the run directory.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
 
     @property
     def metrics(self) -> list[dict[str, Any]]:
@@ -56,6 +64,37 @@ class Result:
     def summary(self) -> dict[str, Any]:
         """`member name -> final numbers`, as in `summary.json`."""
         return run_directory.read_config_file(self.path / "summary.json")["members"]
+
+    def plot(self) -> Any:
+        """Draws the learning curves, mean and seeds of each arm, as a matplotlib figure.
+
+        Raises:
+          SaunaError: no episode has finished.
+        """
+        figure = curve_figure(self.path)
+        if figure is None:
+            raise SaunaError(f"{self.path}: no episode has finished, so there is no curve")
+        return figure
+
+    def table(self, of: str = "members") -> Any:
+        """A pandas DataFrame, or a list of dicts if pandas is not installed.
+
+        Args:
+          of: "members": the final numbers of each; "metrics": the rows of `metrics.jsonl`.
+
+        Raises:
+          BadInput: `of` is something else.
+        """
+        if of not in ("members", "metrics"):
+            raise BadInput(f"table: of must be 'members' or 'metrics', not {of!r}")
+        rows = self.metrics
+        if of == "members":
+            rows = [{"member": name, **numbers} for name, numbers in self.summary.items()]
+        try:
+            import pandas
+        except ImportError:
+            return rows
+        return pandas.DataFrame(rows)
 
     def policy(self, member: int | str = 0, *, best: bool = False) -> Any:
         """The trained policy of a member, as `policy(observation) -> action`.
@@ -73,6 +112,7 @@ class _Silent(PlainDisplay):
         pass
 
 
+@lists_settings(_OF_TRAIN)
 def train(
     env: Any,
     *,
@@ -123,14 +163,10 @@ def train_and_draw(
     Raises:
       BadInput, Interrupted, SaunaError: as `train_run`.
     """
-    try:
-        if train_run(run, display, resume=resume, inexact=inexact, callback=callback):
-            draw_curve(run.path)
-    except Interrupted:
-        draw_curve(run.path)
-        raise
+    train_run(run, display, resume=resume, inexact=inexact, callback=callback, draw=draw_curve)
 
 
+@lists_settings(_OF_COMPARE)
 def compare(
     env: Any,
     *,
@@ -210,13 +246,15 @@ def resume(
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    rest = provide(Path(path), changes, PARTS)
+    named = {n: _named(n, v) if n == "track" else v for n, v in changes.items()}
+    rest = provide(Path(path), named, PARTS)
     how = trust, accept_changed_code, restart_schedule
     run = runs.reopen(Path(path), rest, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact, callback=callback)
     return Result(run.path)
 
 
+@names_the_folder
 def load(
     path: str | Path,
     member: int | str = 0,
@@ -248,4 +286,6 @@ def load(
 
 def _named(name: str, value: Any) -> Any:
     """Names a part that was passed by value; other values stay."""
+    if name == "track" and value is not None and not isinstance(value, str):
+        return [name_of(one) for one in (value if isinstance(value, list | tuple) else [value])]
     return name_of(value) if name in PARTS and value is not None else value

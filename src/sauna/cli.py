@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from sauna import __version__
 from sauna.config.accepted import translate
 from sauna.config.flags import add_fields, shown_values
-from sauna.config.other_names import flag_hint
+from sauna.config.other_names import flag_hint, spread_hint
 from sauna.config.parsing import whole_number
 from sauna.config.presets import (
     COMPARED,
@@ -127,8 +127,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     compare.add_argument("env", nargs="*", metavar="ENV | RUN RUN", help=text)
     compare.add_argument("--tag", default="", help="of the returns in TensorBoard files")
     arms = ",".join(COMPARED)
-    text = f"what to compare, also module:name of a rule of your own (default {arms}); the first is"
-    text += " the baseline"
+    text = f"what to compare, also your module:rule; the first is the baseline (default {arms})"
     compare.add_argument("--arms", default=arms, help=f"{text}; all: every rule, in a tournament")
     text = "a tournament of ppo and these (see `sauna list rules`): more seeds where it is open"
     compare.add_argument("--rules", default="", metavar="RULE,...", help=text)
@@ -225,7 +224,7 @@ def _run(arguments: list[str]) -> None:
             for action in _subparser(parser, parsed.command)._actions
             for option in action.option_strings
         ]
-        hint = flag_hint(unknown[0], flags, parsed.command)
+        hint = spread_hint(arguments, unknown[0]) or flag_hint(unknown[0], flags, parsed.command)
         raise BadInput(f"unknown argument {unknown[0]!r}{hint}")
     values = {name: value for name, value in vars(parsed).items() if name != "command"}
     if parsed.command is None:
@@ -266,8 +265,9 @@ def _train(values: dict[str, Any]) -> None:
 
 def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
     """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
-    replaced = {"seed": "seeds", "batch_size": "minibatches"}
+    replaced = {"seed": "seeds", "batch_size": "minibatches", "target_kl": "stop"}
     gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
+    gone += ["stop_kwargs"] * ("stop" in gone)
     return {k: v for k, v in stored.items() if k not in gone} | typed
 
 
@@ -368,12 +368,11 @@ def _runs(values: dict[str, Any]) -> None:
 
 
 def _study(values: dict[str, Any]) -> None:
-    from sauna.config.trust import named_code
     from sauna.experiments.study.command import check_study, load_spec, study_command
 
     name, trust, out = values.pop("study"), values.pop("trust"), values["out"]
     spec = load_spec(name, lambda text: check_study(text, Path(out), trust))
-    _run_study(spec, study_command(name, out, bool(named_code(spec.text))), **values)
+    _run_study(spec, study_command(name, out, spec.text), **values)
 
 
 def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:

@@ -43,6 +43,15 @@ def test_every_page_is_in_the_navigation() -> None:
     assert listed == {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
 
 
+def test_each_page_of_a_rule_family_has_one_picture_that_a_command_draws() -> None:
+    script = (DOCS / "_build" / "rule_pictures.py").read_text()
+    pages = sorted((DOCS / "rules").glob("*.md"))
+    shown = [re.findall(r"images/rules/(\w+)\.svg", page.read_text()) for page in pages]
+    assert len(pages) == 7 and all(len(names) == 1 for names in shown)
+    assert {path.stem for path in (DOCS / "images" / "rules").iterdir()} == {n for (n,) in shown}
+    assert all(f'"{name}": (' in script for (name,) in shown)
+
+
 def test_the_findings_are_those_of_the_result_files() -> None:
     """If this fails, run `python results/make.py`."""
     assert findings("docs/results/") in README.read_text()

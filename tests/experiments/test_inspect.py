@@ -29,14 +29,13 @@ from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import advantages, decide
 from sauna.experiments.inspect.inspection import (
     Inspection,
-    _stream,
     examine,
     pixel_stride,
     principal_components,
-    scaled,
 )
 from sauna.experiments.inspect.page import meaning
 from sauna.experiments.inspect.recording import MAX_FRAMES, SIDE, Frames, Recorder, _played
+from sauna.experiments.inspect.streams import scaled, stream_of
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
 from worlds import Drawn, Lives, Scripted
@@ -121,18 +120,25 @@ def scored(vex: np.ndarray) -> ScoredStep:
 
 def test_lost_lives_and_signs_are_what_is_learned() -> None:
     """Three lives of two steps in one game, rewards 5 and -3."""
-    policy: Any = SimpleNamespace(see=np.asarray, predict=lambda x: (np.zeros(len(x)), None))
+    policy: Any = SimpleNamespace(
+        see=np.asarray,
+        act=lambda observation, deterministic, key: np.array([1]),
+        write=lambda action: action[0],
+        predict=lambda x: (np.zeros(len(x)), None),
+        log_prob=lambda seen, action: np.zeros(len(seen)),
+    )
     recorder = Recorder(Lives(), policy, None)
-    recorder.reset(seed=0)
+    observation, _ = recorder.reset(seed=0)
     for _ in range(6):
-        recorder.step(0)
+        recorder.step(recorder.act(observation, deterministic=True, key=None))
     played = _played(recorder, [6.0], None)
     assert played.reward.tolist() == [5.0, -3.0] * 3 and played.terminated.sum() == 1
     config = configured(arm="ppo", sign_rewards=True, normalize_rewards=False)
     reward = scaled(config, {}, played.reward)
     assert reward.tolist() == [1.0, -1.0] * 3
-    stream = _stream(policy, played, reward, np.zeros(6), np.ones(6, bool))
-    assert stream.terminated[:, 0].tolist() == [False, True] * 3
+    stream: Any = stream_of(policy, config, {}, played)
+    assert stream.terminated.tolist() == [False, True] * 3
+    assert stream.reward.tolist() == reward.tolist() and stream.action.tolist() == [[1]] * 6
 
 
 @pytest.mark.parametrize("arm", ["sauna", "random-drop"])
@@ -182,7 +188,7 @@ def test_the_units_of_signs_are_signs(run, found) -> None:
 def test_a_run_is_decided_by_its_own_head_and_settings(run, found) -> None:
     config = found.member.config
     policy = TrainedPolicy(load_artifact(run), "sauna/0")
-    _, vex = policy.predict(found.played.observation)
+    _, vex = policy.heads(found.played.observation)
     medians, keep, rollouts = by_hand(config, vex[:, None])
     assert found.decisions.keep.tolist() == keep and found.decisions.rollouts == rollouts
     np.testing.assert_allclose(found.decisions.median, medians, rtol=1e-5)
@@ -210,7 +216,7 @@ def test_advantages_by_hand(run, found) -> None:
     reward = np.clip(found.played.reward / std, -10, 10)
     np.testing.assert_allclose(found.reward, reward, rtol=1e-12)
     policy, played = TrainedPolicy(artifact, "sauna/0"), found.played
-    value, finals = policy.predict(played.observation)[0], policy.predict(played.final)[0]
+    value, finals = policy.heads(played.observation)[0], policy.heads(played.final)[0]
     np.testing.assert_array_equal(found.value, value)
     starts = {*found.decisions.rollouts}
     later, episode, expected = 0.0, len(finals), np.zeros(len(value))

@@ -188,10 +188,10 @@ MUTANTS = [
         ("no Vex loss", "vex_loss, mean_entropy, hypers)", "0.0 * vex_loss, mean_entropy, hypers)"),
     ),
     *_of(
-        "algorithm/learner/update.py",
+        "algorithm/learner/optimizers.py",
         "a2c",
-        ("RMSProp starts at 0", "initial_scale=1.0", "initial_scale=0.0"),
-        ("epsilon beside the root", "eps_in_sqrt=True", "eps_in_sqrt=False"),
+        ("RMSProp starts at 0", '"initial_scale": 1.0', '"initial_scale": 0.0'),
+        ("epsilon beside the root", '"eps_in_sqrt": True', '"eps_in_sqrt": False'),
     ),
     *_of(
         "algorithm/policy/normalize.py",
@@ -220,25 +220,31 @@ MUTANTS = [
         ),
     ),
     *_of(
-        "algorithm/learner/update.py",
-        "ppo samples faults/test_07_poisoned_batch",
-        (
-            "uphill",
-            "state.params - hypers.learning_rate * step",
-            "state.params + hypers.learning_rate * step",
-        ),
+        "algorithm/learner/optimizers.py",
+        "ppo samples optimizers faults/test_07_poisoned_batch",
         (
             "element-wise clipping",
             "optax.clip_by_global_norm(hypers.max_grad_norm)",
             "optax.clip(hypers.max_grad_norm)",
         ),
         ("no clipping", "optax.clip_by_global_norm(hypers.max_grad_norm)", "optax.identity()"),
+        ("other epsilon of Adam", '"eps": config.adam_epsilon', '"eps": 1e-2'),
+        ("the KL raises the rate", "kl > 2.0 * config.desired_kl", "kl < 2.0 * config.desired_kl"),
+        ("the rate has no floor", "rate / FACTOR, config.learning_rate_min", "rate / FACTOR, 0.0"),
+    ),
+    *_of(
+        "algorithm/learner/update.py",
+        "ppo samples faults/test_07_poisoned_batch",
+        (
+            "uphill",
+            "state.params - rate * step",
+            "state.params + rate * step",
+        ),
         (
             "Adam forgets",
-            "return TrainState(params, scale, state.sampler)",
-            "return TrainState(params, state.optimizer, state.sampler)",
+            "return TrainState(params, scale, state.sampler",
+            "return TrainState(params, state.optimizer, state.sampler",
         ),
-        ("other epsilon of Adam", "eps=config.adam_epsilon", "eps=1e-2"),
         ("minibatches repeat", "default_rng([seed, iteration])", "default_rng([seed])"),
         ("one order for all members", "default_rng([seed, iteration])", "default_rng([iteration])"),
         (
@@ -367,13 +373,12 @@ MUTANTS = [
         ("random drop inverted", ">= hypers.drop_rate", "< hypers.drop_rate"),
     ),
     *_of(
-        "training/loop/budget.py",
-        "vex_filter coverage",
-        (
-            "schedule the other way",
-            '"rising": threshold * (1.0 - left)',
-            '"rising": threshold * left',
-        ),
+        "training/loop/schedules.py",
+        "vex_filter schedules coverage",
+        ("schedule the other way", "value * (1.0 - left)", "value * left"),
+        ("half a cosine", "1.0 + cos(np.pi", "1.0 + cos(0.5 * np.pi"),
+        ("the warm-up counts from the start", "(used + coming)", "used"),
+        ("no schedule after the warm-up", "left / (1.0 - config.warmup)", "left"),
     ),
     *_of(
         "algorithm/selection/gigaflow.py",

@@ -11,7 +11,8 @@ import sauna
 from command_line import sauna_here
 from helpers import SMALL, configured
 from sauna.algorithm.selection.registry import make_filter
-from sauna.config.presets import ARMS, arm_settings, resolve
+from sauna.config.arms import ARMS, arm_settings, fixed_by
+from sauna.config.presets import resolve
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
@@ -36,6 +37,7 @@ def test_rules_that_fit_are_taken(spaces: Spaces) -> None:
         {"sampler": "own_rules:scoreless", "control": "stride"},
         {"loss_weight": "own_rules:softened", "loss_weight_kwargs": '{"power": 2}'},
         {"stop": "own_rules:far", "stop_kwargs": '{"limit": 0.1}'},
+        {"objective": "own_rules:one_sided", "critic": "own_rules:robust"},
     ):
         check_plugins(of(**settings), spaces)
 
@@ -75,7 +77,35 @@ REFUSED = [
     ({"sampler": "pods", "sampler_kwargs": '{"size": 7}'}, "unexpected keyword argument 'size'"),
     ({"stop": "espo", "stop_kwargs": '{"limit": "x"}'}, "limit must be a number at least 0"),
     ({"loss_weight": "delight", "loss_weight_kwargs": '{"on": "x"}'}, "on must be one of mean"),
+    ({"critic": "own_rules:each_error"}, "a loss of shape (4,) and type float32 instead of ()"),
+    ({"objective": "own_rules:averaged"}, "terms of shape () and type float32 instead of (4,)"),
+    ({"critic": "own_rules:single"}, "critic: own_rules:single is not a function"),
+    (
+        {"arm": "prioritized", "sampler_kwargs": '{"share": 0.5}', "selection_losses": "policy"},
+        "prioritized draws as many rows as the rollout has, for the critic; leave out its share",
+    ),
+    ({"arm": "gradient-norm", "normalize_over": "kept"}, "draws and keeps no set; use rollout"),
 ]
+
+
+ONLY_CONTINUOUS = [
+    ({"arm": "delight", "loss_weight_kwargs": '{"centred": false}'}, "delight reads centred for"),
+    ({"arm": "delight", "loss_weight_kwargs": '{"on": "all"}'}, "delight reads on for continuous"),
+    ({"arm": "kondo", "sampler_kwargs": '{"centred": true}'}, "kondo reads centred for continuous"),
+]
+
+
+@pytest.mark.parametrize("settings, text", ONLY_CONTINUOUS)
+def test_arguments_that_bits_do_not_read_are_refused(settings: dict[str, Any], text: str) -> None:
+    check_plugins(of(**settings), SPACES)
+    with pytest.raises(BadInput, match=text):
+        check_plugins(of(**settings), BITS)
+
+
+def test_a_share_that_is_read_with_losses_of_the_policy_alone() -> None:
+    check_plugins(of(arm="kondo", sampler_kwargs='{"share": 0.5}'), SPACES)
+    check_plugins(of(arm="prioritized", selection_losses="policy"), SPACES)
+    check_plugins(of(arm="top-advantage", normalize_over="kept"), SPACES)
 
 
 @pytest.mark.parametrize("settings, text", REFUSED)
@@ -163,6 +193,20 @@ MISTAKEN = [
     ({"arm": "gigafow"}, "did you mean 'gigaflow'"),
     ({"sampler": "kondu"}, "did you mean 'kondo'"),
     ({"arm": "pods", "sampler_kwargs": '{"share": Infinity}'}, "JSON has no infinity"),
+    ({"arm": "gigaflow", "sampler": "pods"}, "sampler: fixed by arm gigaflow; `--arm ppo` lets"),
+    ({"arm": "gigaflow", "filter": "sauna"}, "filter: fixed by arm gigaflow; `--arm sauna` lets"),
+    ({"arm": "gigaflow+avec", "critic": "squared"}, "critic: fixed by arm gigaflow+avec"),
+    ({"arm": "gigaflow+random", "control": "stride"}, "control: fixed by arm gigaflow+random"),
+    ({"arm": "espo", "objective": "clip"}, "objective: fixed by arm espo"),
+    ({"arm": "merl", "auxiliary": "none"}, "auxiliary: fixed by arm merl"),
+    ({"arm": "avec", "clip_value": True}, "clip_value: not read by arm avec"),
+    ({"arm": "positive", "normalize_advantages": False}, "normalize_advantages: not read by arm"),
+    ({"arm": "kondo", "selection_mode": "smaller"}, "a sampler with selection_losses=all"),
+    ({"normalize_over": "kept"}, "normalize_over: kept needs a sampler"),
+    ({"arm": "recompute", "epochs": 1}, "recompute_advantages: needs more than one epoch"),
+    ({"arm": "recompute", "preset": "a2c"}, "recompute_advantages: needs more than one epoch"),
+    ({"arm": "spo", "preset": "a2c"}, "objective: spo needs a ratio, which A2C has none of"),
+    ({"arm": "sample-dropout", "preset": "a2c"}, "sample-dropout needs a ratio other than 1"),
 ]
 
 
@@ -182,6 +226,30 @@ def test_joined_rules_are_those_of_each_part() -> None:
     assert arm_settings("gigaflow+random") == {**ARMS["gigaflow"], "control": "random"}
     resolved = resolve({"env": "worlds:Scripted", "arm": "gigaflow+stride"})
     assert (resolved.sampler, resolved.control, resolved.filter) == ("gigaflow", "stride", "none")
+
+
+FREE = [
+    ("sauna+avec", {"filter": "random-drop", "drop_rate": 0.5}, "filter", "random-drop"),
+    ("ppo", {"sampler": "pods"}, "sampler", "pods"),
+    ("gigaflow", {"sampler_kwargs": '{"threshold": 0.1}'}, "sampler_kwargs", '{"threshold":0.1}'),
+    ("vex-head", {"auxiliary": "shuffled-observation"}, "auxiliary", "shuffled-observation"),
+    ("kondo", {"selection_losses": "all"}, "selection_losses", "all"),
+]
+
+
+@pytest.mark.parametrize("arm, settings, name, value", FREE)
+def test_what_an_arm_leaves_free(arm: str, settings: dict[str, Any], name: str, value: Any) -> None:
+    found = resolve({"env": "worlds:Scripted", "arm": arm, **settings})
+    assert str(getattr(found, name)).replace(" ", "") == value
+
+
+def test_every_rule_of_an_arm_is_fixed_by_it() -> None:
+    """But for what its set is normalised over and which losses it touches."""
+    free = {"normalize_over", "selection_losses", "clip_value", "vex_target"}
+    for arm in ARMS:
+        if not arm.startswith(("sauna", "vex-head", "random", "ppo")):
+            changed = {k for k, v in ARMS[arm].items() if v != ARMS["ppo"].get(k)} - free
+            assert changed <= fixed_by(arm), arm
 
 
 def test_an_own_filters_arguments_matter() -> None:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
 from sauna.config.presets import resolve_run
 from sauna.training import display
-from sauna.training.display import PlainDisplay, columns_of, counted, returns
+from sauna.training.display import (
+    NotebookDisplay,
+    PlainDisplay,
+    columns_of,
+    counted,
+    make_display,
+    returns,
+)
 
 
 def titles(**settings: object) -> list[str]:
@@ -70,3 +80,46 @@ def test_many_members_are_summed_up_by_arm() -> None:
 
 def test_one_is_singular() -> None:
     assert [counted(n, "task") for n in (0, 1, 2000)] == ["0 tasks", "1 task", "2,000 tasks"]
+
+
+def kernel(monkeypatch: pytest.MonkeyPatch, shell: Any) -> list[str]:
+    """Stands for IPython; the tables that its cell shows, in order."""
+    shown: list[str] = []
+
+    def display(html: str, display_id: bool) -> Any:
+        assert display_id
+        shown.append(html)
+        return SimpleNamespace(update=shown.append)
+
+    python, parts = ModuleType("IPython"), ModuleType("IPython.display")
+    python.get_ipython = lambda: shell  # type: ignore[attr-defined]
+    parts.display, parts.HTML = display, str  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "IPython", python)
+    monkeypatch.setitem(sys.modules, "IPython.display", parts)
+    return shown
+
+
+def test_a_notebook_shows_a_table_that_is_redrawn(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    shown = kernel(monkeypatch, SimpleNamespace(kernel=object()))
+    ours = make_display()
+    assert isinstance(ours, NotebookDisplay)
+    run = resolve_run({"env": "none", "seeds": 2, "steps": 1e4})
+    ours.open(run.config, run.members, Path("run"), [])
+    ours.phase(0, "compiling <x>")
+    ours.rows([{"member": "ppo/1", "env_steps": 5_000, "kept_steps": 5_000, "kl": 0.0123}])
+    monkeypatch.setattr("sauna.training.display.NOTEBOOK_SECONDS", -1.0)
+    ours.refresh()
+    ours.summary({})
+    ours.close()
+    assert len(shown) == 3 and shown[1] == shown[2]
+    assert "<caption>compiling &lt;x&gt;, 25%</caption>" in shown[1]
+    assert "<tr><td>ppo/0</td><td>-</td>" in shown[1]
+    assert "<tr><td>ppo/1</td><td>5,000</td>" in shown[1] and "<td>0.0123</td>" in shown[1]
+    assert "writing to run" in capsys.readouterr().out
+
+
+def test_ipython_in_a_terminal_is_no_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel(monkeypatch, SimpleNamespace())
+    assert type(make_display()) is PlainDisplay
+    kernel(monkeypatch, None)
+    assert type(make_display()) is PlainDisplay

@@ -5,17 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 import sauna
 from helpers import SMALL, Recorder, equal, make_job, own, resumed, train_here
-from sauna.algorithm.rollout.play import Episode
+from jax_worlds import LENGTH, informative
+from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.rollout.play import Episode, play, play_on_device
 from sauna.config.presets import resolve
+from sauna.envs.device.contract import flat
 from sauna.system.errors import BadInput
 from sauna.training.loop.evaluation import Evaluated
 from sauna.training.summary import STOPS, summarize
 from sauna.training.worker import train_members
+from worlds import Informative, Scripted
 
 BACKENDS = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}
 WATCHED = {"eval_every": 64, "eval_episodes": 3, "checkpoint_every": 1}
@@ -163,3 +168,38 @@ def test_what_only_evaluations_read_is_refused_without_them(name: str, tmp_path:
     with pytest.raises(BadInput, match=f"{name}: not read .* it needs eval_every above 0"):
         sauna.train("worlds:Scripted", out=tmp_path / "run", **{**SMALL, name: 3})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_episode_says_whether_it_was_a_success() -> None:
+    """`Informative` calls an even length one; of an episode that was cut nothing is known."""
+
+    def still(observation: Any, **how: Any) -> np.ndarray:
+        return np.zeros(2, np.float32)
+
+    episodes = [play(still, Informative(), True, seed) for seed in range(6)]
+    assert [e.success for e in episodes] == [float(e.length % 2 == 0) for e in episodes]
+    assert len({e.success for e in episodes}) == 2
+    assert play(still, Informative(), True, 0, max_steps=1).success is None
+    assert play(still, Scripted(), True, 0).success is None
+    row = Evaluated().see([*episodes[:2], Episode(1.0, 1, True)], 64, dict)
+    assert row["eval_success_rate"] == (episodes[0].success + episodes[1].success) / 2
+    assert "eval_success_rate" not in Evaluated().see([Episode(1.0, 1, False)], 64, dict)
+
+
+def test_an_episode_on_the_device_says_so_too() -> None:
+    job = make_job("jax_worlds:informative", arm="ppo", backend="device", device="cpu")
+    policy = make_policy(job.config, job.spaces)
+    played = play_on_device(
+        policy.init(jax.random.key(0)),
+        None,
+        jax.vmap(jax.random.key)(np.arange(8)),
+        config=job.config,
+        env=flat(informative),
+        policy=policy,
+        deterministic=True,
+        max_steps=LENGTH - 1,
+    )
+    cut, even = np.asarray(played.cut), np.asarray(played.length) % 2 == 0
+    assert 0 < cut.sum() < 8
+    np.testing.assert_array_equal(np.isnan(played.success), cut)
+    np.testing.assert_array_equal(np.asarray(played.success)[~cut], even[~cut])

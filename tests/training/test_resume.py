@@ -6,6 +6,7 @@ import csv
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,6 +41,36 @@ def test_interrupted_after_any_iteration(stops: tuple[int, ...], settings) -> No
         second = train_here(resumed(job, first))
         assert equal(second.final, whole.final)
         assert first.rows + second.rows == whole.rows
+
+
+MOVED = {
+    "arm": "ppo",
+    "learning_rate_schedule": "kl",
+    "clip_range_schedule": "cosine",
+    "entropy_coef": 0.01,
+    "entropy_coef_schedule": "linear",
+    "optimizer": "lion",
+    "weight_decay": 0.1,
+}
+
+
+ON_DEVICE = {"env": "jax_worlds:walk", "backend": "device", "devices": 1}
+
+
+@pytest.mark.parametrize("world", [{"env": WORLD}, pytest.param(ON_DEVICE, marks=pytest.mark.slow)])
+def test_what_moves_during_training_resumes_exactly(world: dict[str, Any]) -> None:
+    """A rate that follows the KL, two schedules, an optimizer of optax; on host and device."""
+    job = make_job(envs=2, steps=512, checkpoint_every=3, **world, **MOVED)
+    whole = train_here(job)
+    second = train_here(job._replace(restored=whole.states[3], start=3))
+    assert equal(second.final, whole.final)
+    assert second.rows == whole.rows[3:]
+    rates, clips = ([row[key] for row in whole.rows] for key in ("learning_rate", "clip_range"))
+    assert whole.final["ppo/0/learning_rate"] == np.float32(rates[-1])
+    assert len(set(rates)) > 1 and all(1e-5 <= rate <= 1e-2 for rate in rates)
+    left = 1 - np.arange(8) / 8
+    np.testing.assert_allclose(clips, 0.1 * (1 + np.cos(np.pi * (1 - left))), rtol=1e-5)
+    np.testing.assert_allclose([row["entropy_coef"] for row in whole.rows], 0.01 * left, rtol=1e-5)
 
 
 def test_resuming_a_complete_run_does_nothing(tmp_path: Path, capsys) -> None:

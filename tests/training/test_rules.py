@@ -12,6 +12,7 @@ import pytest
 from arrays import random_rollout
 from helpers import configured, equal, make_job, resumed, train_here
 from sauna.algorithm.learner.program import make_learner, make_parts
+from sauna.algorithm.learner.selected import drawn_length
 from sauna.algorithm.learner.update import device_minibatch_order
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.selection.control import controlled_filter
@@ -26,7 +27,7 @@ slow = pytest.mark.slow
 RULES = [arm for arm in ARMS if arm not in ("ppo", "random-drop", "sauna-reference")]
 SAMPLERS = [arm for arm in ARMS if ARMS[arm].get("sampler", "none") != "none"]
 FAST = "gigaflow+random"
-STATEFUL = {"gigaflow+random": 1, "prioritized": 1, "kondo": 0}
+STATEFUL = {"gigaflow+random": 1, "prioritized": 1, "kondo": 0, "sauna+random": 0}
 WALK = {"envs": 2, "steps": 512}
 
 
@@ -132,7 +133,8 @@ def test_the_device_learns_what_the_host_learns(arm: str) -> None:
     device, arrays = jax.jit(
         lambda state, rollout: learn_from(parts, state, rollout, setting, h, iteration)
     )(learner.init(keys.init), rollout)
-    order = device_minibatch_order(config, jax.random.fold_in(keys.order, iteration))
+    own = jax.random.fold_in(keys.order, iteration)
+    order = device_minibatch_order(config, own, drawn_length(parts.learning))
     key = selection_key(keys, iteration)
     batch = learner.make_batch(rollout, h, key)
     host, said = learner.learn(learner.init(keys.init), rollout, batch, h, order, key)

@@ -70,8 +70,9 @@ class TrainState(NamedTuple):
     """What learning changes. Parameters are one flat vector, so that a step is a few vector ops."""
 
     params: Array  # [D] float32, the raveled parameter pytree
-    optimizer: Any  # optax's ScaleByAdamState (count int32, mu [D], nu [D]) or ScaleByRmsState
+    optimizer: Any  # optax's: ScaleByAdamState (count int32, mu [D], nu [D]), or another
     sampler: Any = ()  # what a selection rule carries from one iteration to the next
+    learning_rate: Any = ()  # [] of the last step, 0 before the first; () unless the KL moves it
 
 
 class PolicyOutput(NamedTuple):

@@ -1,18 +1,22 @@
-"""`seed` and `batch_size`, which other trainers have, as the fields that they stand for."""
+"""`seed`, `batch_size` and `target_kl`, which other trainers have, as what they stand for."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 from sauna.config.other_names import ACCEPTED
 from sauna.config.parsing import read_value
 from sauna.config.presets import arm_config, parse_all
+from sauna.config.settings import parse
 from sauna.system.errors import BadInput
 
 
 def translate(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replaces `seed` (the one seed) and `batch_size` (samples per minibatch) by our fields.
+    """Replaces `seed` (the one seed), `batch_size` (samples per minibatch) and `target_kl`.
+
+    `target_kl` is the limit of the stop rule of that name, as in Stable-Baselines3.
 
     Raises:
       BadInput: one is given beside the field that it replaces, or does not divide the rollout.
@@ -29,7 +33,24 @@ def translate(values: Mapping[str, Any]) -> dict[str, Any]:
         if size < 1 or samples % size:
             raise BadInput(f"batch_size: {size} does not divide rollout_steps x envs = {samples}")
         found["minibatches"] = samples // size
+    if values.get("target_kl") is not None:
+        found |= _stop_at(values["target_kl"], found)
     return found
+
+
+def _stop_at(limit: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    if given.get("stop") not in (None, "target-kl"):
+        raise BadInput("target_kl: give either target_kl or stop, not both")
+    try:
+        number = float(limit)
+    except (ValueError, TypeError):
+        raise BadInput(f"target_kl: cannot read {limit!r} as float") from None
+    if not 0 < number < float("inf"):
+        raise BadInput(f"target_kl: must be a number above 0, not {limit}")
+    kwargs = json.loads(parse("stop_kwargs", given.get("stop_kwargs") or "{}"))
+    if "limit" in kwargs:
+        raise BadInput("target_kl: give either target_kl or the limit in stop_kwargs, not both")
+    return {"stop": "target-kl", "stop_kwargs": json.dumps({**kwargs, "limit": number})}
 
 
 def _refuse_both(values: Mapping[str, Any], name: str, ours: str) -> None:

@@ -105,9 +105,28 @@ def check_consistent(config: Config) -> None:
         )
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
+    check_rate(config)
     check_rules(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
+
+
+def check_rate(config: Config) -> None:
+    """Refuses a learning rate that its schedule cannot move.
+
+    Raises:
+      BadInput: with the one line that says why.
+    """
+    if config.learning_rate_schedule != "kl":
+        return
+    if config.algorithm != "ppo":
+        raise BadInput("learning_rate_schedule: kl needs algorithm ppo, which measures the KL")
+    least, most = config.learning_rate_min, config.learning_rate_max
+    if not least <= config.learning_rate <= most:
+        raise BadInput(
+            f"learning_rate: {config.learning_rate} lies outside learning_rate_min {least} and "
+            f"learning_rate_max {most}"
+        )
 
 
 def check_rules(config: Config) -> None:
@@ -136,13 +155,31 @@ def check_rules(config: Config) -> None:
         for name, plain in unfit:
             if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
                 raise BadInput(f"{name}: needs gae_over=all")
-    if config.algorithm == "a2c" and config.stop != "none":
-        raise BadInput("stop: A2C makes one pass, which nothing stops early")
+    check_passes(config)
+    if config.normalize_over == "kept" and config.sampler == "none":
+        raise BadInput("normalize_over: kept needs a sampler; without one it is rollout")
     if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
         raise BadInput(
             "objective: unclipped needs a stop rule (espo) or a loss_weight "
             "(sample-dropout): nothing else bounds the ratio"
         )
+
+
+def check_passes(config: Config) -> None:
+    """Refuses rules that need a ratio other than 1, or a second epoch, where there is none.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.algorithm == "a2c":
+        if config.stop != "none":
+            raise BadInput("stop: A2C makes one pass, which nothing stops early")
+        if config.objective != "clip":
+            raise BadInput(f"objective: {config.objective} needs a ratio, which A2C has none of")
+        if config.loss_weight == "sample-dropout":
+            raise BadInput("loss_weight: sample-dropout needs a ratio other than 1; A2C's is 1")
+    if config.recompute_advantages and (config.algorithm == "a2c" or config.epochs == 1):
+        raise BadInput("recompute_advantages: needs more than one epoch")
 
 
 def local_parts(config: Config) -> list[str]:

@@ -66,7 +66,8 @@ def changed_code(before: Mapping[str, Any], now: Mapping[str, str]) -> str:
 
 
 def _named_modules(settings: Mapping[str, Any], env: str) -> list[str]:
-    found = [name.partition(":")[0] for _, name in named_code(settings)]
+    named = (name for field, name in named_code(settings) if field != "track")  # computes nothing
+    found = [name.partition(":")[0] for name in named]
     gymnasium: Any = sys.modules.get("gymnasium")
     spec = None
     if gymnasium and env.split("/")[0] not in PACKAGES:  # those count by their package's version

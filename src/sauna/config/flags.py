@@ -1,12 +1,12 @@
-"""Fields of `Config` as flags of a command, grouped, with types and the defaults that hold."""
+"""Fields of `Config` as flags of a command and keywords of a function: types, defaults, help."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import typing
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
 from sauna.config.fields import GROUPS
 from sauna.config.presets import arm_config
@@ -15,6 +15,7 @@ from sauna.config.zoo import AUTO, entry_of
 from sauna.system.errors import BadInput
 
 FIRST = "most needed"
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def add_fields(
@@ -33,8 +34,20 @@ def add_fields(
         group = parser.add_argument_group(f"{title}{_of_preset(title, values)}")
         for name in members:
             _add_field(group, name, values[name])
-        if title == FIRST:
-            _add_accepted(group, chosen)
+        _add_accepted(group, members)
+
+
+def lists_settings(names: Iterable[str]) -> Callable[[F], F]:
+    """Makes a decorator that adds the fields to a function's docstring, for `help`."""
+    texts = (f"      {name}: {FIELDS[name].metadata['help']}" for name in names)
+    head = "\n    Settings (the preset has what is not given; `sauna train ENV --help` shows it):\n"
+    listed = head + "\n".join(texts) + "\n    "
+
+    def add(function: F) -> F:
+        function.__doc__ = (function.__doc__ or "").rstrip(" ") + listed
+        return function
+
+    return add
 
 
 def _of_preset(title: str, values: Mapping[str, Any]) -> str:
@@ -64,14 +77,17 @@ def _add_field(group: Any, name: str, value: Any) -> None:
 
 
 def _add_accepted(group: Any, chosen: list[str]) -> None:
-    """Adds the flags that stand for a field; see `other_names.translate`."""
+    """Adds the flags that stand for one of the fields `chosen`; see `accepted.translate`."""
+    batch = "samples per minibatch, in place of --minibatches"
+    kl = "stop an iteration whose KL divergence exceeds 1.5 times this, in place of --stop"
     texts = {
-        "seeds": ("seed", "this one seed, in place of --seeds"),
-        "minibatches": ("batch_size", "samples per minibatch, in place of --minibatches"),
+        "seeds": ("seed", "INT", "this one seed, in place of --seeds"),
+        "rollout_steps": ("batch_size", "INT", batch),
+        "stop": ("target_kl", "FLOAT", kl),
     }
-    for ours, (name, text) in texts.items():
+    for ours, (name, kind, text) in texts.items():
         if ours in chosen:
-            group.add_argument(flag(name), default=argparse.SUPPRESS, help=text, metavar="INT")
+            group.add_argument(flag(name), default=argparse.SUPPRESS, help=text, metavar=kind)
 
 
 def metavar(name: str) -> str:

@@ -10,24 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from sauna.config import readers
+from sauna.config import choices, readers
 from sauna.config.fields import option
 from sauna.config.run_options import RunOptions
-
-FILTERS = ("none", "sauna", "random-drop")
-SAMPLERS = (
-    "none",
-    "gigaflow",
-    "top-advantage",
-    "prioritized",
-    "gradient-norm",
-    "kondo",
-    "positive",
-    "pods",
-    "vex-oracle",
-)
-VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
-NETWORKS = ("auto", "mlp", "nature-cnn")
 
 _learning = partial(option, group="learning")
 _network = partial(option, group="network")
@@ -51,7 +36,43 @@ class Config(RunOptions):
         3e-4, "the optimizer's step size", above=0, common=True, shapes_program=False
     )
     learning_rate_schedule: str = _learning(
-        "linear", "over the budget of steps: to 0, or constant", choices=("linear", "constant")
+        "linear",
+        "over the budget of steps: to 0, constant, as a function says, or held by the KL (kl)",
+        choices=("linear", "constant", "cosine", "kl"),
+        plugin=True,
+    )
+    warmup: float = _learning(
+        0.0,
+        "share of the budget over which the learning rate rises first",
+        at_least=0,
+        at_most=0.99,
+        read_when=readers.NO_KL_RATE,
+    )
+    desired_kl: float = _learning(
+        0.01,
+        "the KL divergence that schedule kl holds: above twice of it the rate is divided by 1.5, "
+        "below half of it multiplied",
+        above=0,
+        read_when=readers.KL_RATE,
+    )
+    learning_rate_min: float = _learning(
+        1e-5, "the least rate of schedule kl", above=0, read_when=readers.KL_RATE
+    )
+    learning_rate_max: float = _learning(
+        1e-2, "the largest rate of schedule kl", above=0, read_when=readers.KL_RATE
+    )
+    optimizer: str = _learning(
+        "adam",
+        "what makes a step of the gradient: an optimizer here or of optax (optax:adan)",
+        choices=choices.OPTIMIZERS,
+        plugin=True,
+    )
+    optimizer_kwargs: str = _learning("{}", "arguments of the optimizer, as a JSON object")
+    weight_decay: float = _learning(
+        0.0,
+        "share of each parameter taken off in a step, times the learning rate (0: what the "
+        "optimizer does by itself)",
+        at_least=0,
     )
     schedule_start: int = _learning(
         0,
@@ -59,7 +80,6 @@ class Config(RunOptions):
         at_least=0,
         read_when=readers.SCHEDULED,
     )
-    optimizer: str = _learning("adam", "what scales the gradient", choices=("adam", "rmsprop"))
     adam_epsilon: float = _learning(1e-5, "Adam's epsilon", above=0, read_when=readers.ADAM)
     rmsprop_epsilon: float = _learning(
         1e-5, "RMSProp's epsilon, under the root", above=0, read_when=readers.RMSPROP
@@ -81,12 +101,28 @@ class Config(RunOptions):
         shapes_program=False,
         read_when=readers.PPO,
     )
-    clip_value: bool = _learning(
-        True, "clip the value function's change as the ratio's", read_when=readers.PPO
+    clip_range_schedule: str = _learning(
+        "constant",
+        "over the budget of steps: constant, to 0 (linear, cosine), or a factor of your own",
+        choices=choices.SCHEDULES,
+        plugin=True,
+        read_when=readers.PPO,
     )
-    normalize_advantages: bool = _learning(True, "standardise the advantages of each minibatch")
+    clip_value: bool = _learning(
+        True, "clip the value function's change as the ratio's", read_when=readers.SQUARED
+    )
+    normalize_advantages: bool = _learning(
+        True, "standardise the advantages of each minibatch", read_when=readers.CENTRED
+    )
     entropy_coef: float = _learning(
         0.0, "weight of the entropy bonus", at_least=0, shapes_program=False
+    )
+    entropy_coef_schedule: str = _learning(
+        "constant",
+        "as the clip range's",
+        choices=choices.SCHEDULES,
+        plugin=True,
+        read_when=readers.ENTROPY,
     )
     value_coef: float = _learning(0.5, "weight of the value loss", at_least=0, shapes_program=False)
     gamma: float = _learning(0.99, "discount", at_least=0, at_most=1, shapes_program=False)
@@ -97,7 +133,7 @@ class Config(RunOptions):
     network: str = _network(
         "auto",
         "trunk (auto: nature-cnn for images of 36 x 36 pixels or more, else mlp)",
-        choices=NETWORKS,
+        choices=choices.NETWORKS,
         plugin=True,
     )
     hidden: tuple[int, ...] = _network(
@@ -139,21 +175,21 @@ class Config(RunOptions):
     vex_target: str = _rule(
         "sample",
         "what the Vex head regresses",
-        choices=VEX_TARGETS,
+        choices=choices.VEX_TARGETS,
         plugin=True,
         read_when=readers.VEX,
     )
     vex_coef: float = _selection(
         0.5, "weight of the Vex loss (c2 of eq. 6)", at_least=0, shapes_program=False
     )
-    filter: str = _rule("sauna", "which transitions the update keeps", choices=FILTERS, plugin=True)
+    filter: str = _rule("sauna", "which transitions are kept", choices=choices.FILTERS, plugin=True)
     filter_kwargs: str = _rule(
         "{}", "arguments of your own filter, as a JSON object", read_when=readers.OWN_FILTER
     )
     sampler: str = _selection(
         "none",
         "which of the rollout's samples the update learns from, once advantages are known",
-        choices=SAMPLERS,
+        choices=choices.SAMPLERS,
         plugin=True,
     )
     sampler_kwargs: str = _selection(
@@ -167,8 +203,8 @@ class Config(RunOptions):
     )
     selection_mode: str = _selection(
         "fewer",
-        "fewer gradient steps on minibatches of the same size, as many steps on smaller ones, or "
-        "as many of the same size, refilled with what was taken",
+        "fewer gradient steps on minibatches of PPO's size (or as near below it as fills them), as "
+        "many steps on smaller ones, or as many of PPO's size, which repeat the chosen rows",
         choices=("fewer", "smaller", "refill"),
         read_when=readers.MASKED,
     )
@@ -193,6 +229,7 @@ class Config(RunOptions):
         "clip",
         "the policy term: PPO's clip, SPO's penalty, or neither",
         choices=("clip", "spo", "unclipped"),
+        plugin=True,
         read_when=readers.PPO,
     )
     loss_weight: str = _update(
@@ -218,6 +255,7 @@ class Config(RunOptions):
         "squared",
         "the value loss: squared errors, or their variance (AVEC)",
         choices=("squared", "avec"),
+        plugin=True,
     )
     recompute_advantages: bool = _update(
         False, "compute values and advantages anew before each epoch", read_when=readers.PPO

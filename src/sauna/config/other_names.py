@@ -1,15 +1,17 @@
 """What other trainers call a setting, and what it is called here.
 
-Of Stable-Baselines3, CleanRL, rsl_rl and Brax. `seed` and `batch_size` are accepted as they are
-(see `accepted.py`); another name is answered with the one that means the same, as the values may
-count otherwise.
+Of Stable-Baselines3, CleanRL, rsl_rl and Brax. `seed`, `batch_size` and `target_kl` are accepted
+as they are (see `accepted.py`); another name is answered with the one that means the same, as the
+values may count otherwise.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import Any, get_origin
 
-from sauna.config.settings import FIELDS, fields_with, flag
+from sauna.config.settings import FIELDS, TYPES, fields_with, flag
 from sauna.system.errors import nearest
 
 SAME = {
@@ -36,6 +38,11 @@ SAME = {
     "lr_schedule": "learning_rate_schedule",
     "anneal_lr": "learning_rate_schedule",
     "schedule": "learning_rate_schedule",
+    "kl_threshold": "desired_kl",
+    "min_lr": "learning_rate_min",
+    "max_lr": "learning_rate_max",
+    "optimizer_class": "optimizer",
+    "warmup_steps": "warmup",
     "clip_coef": "clip_range",
     "clip_param": "clip_range",
     "clipping_epsilon": "clip_range",
@@ -71,9 +78,12 @@ SAME = {
     "clip_reward": "clip_rewards",
     "episode_length": "env_kwargs",
     "action_repeat": "env_kwargs",
-    "tensorboard_log": "tensorboard",
-    "track": "tensorboard",
-    "wandb_project_name": "tensorboard",
+    "tensorboard": "track",
+    "tensorboard_log": "track",
+    "logger": "track",
+    "wandb": "track",
+    "wandb_project": "track_project",
+    "wandb_project_name": "track_project",
     "save_interval": "checkpoint_every",
     "save_freq": "checkpoint_every",
     "exp_name": "out",
@@ -90,8 +100,6 @@ SAME = {
     "n_seeds": "seeds",
 }
 ADVICE = {
-    "target_kl": "`--stop target-kl` stops an iteration by its KL divergence",
-    "desired_kl": "there is no step size by KL divergence here; see learning_rate_schedule",
     "max_iterations": "give steps: iterations x envs x rollout_steps",
     "num_iterations": "give steps: iterations x envs x rollout_steps",
     "capture_video": "`sauna eval RUN --video` records a trained policy",
@@ -101,7 +109,7 @@ ADVICE = {
     "use_sde": "there is no state-dependent exploration here",
     "policy": "the policy follows from the spaces; `network` chooses its trunk",
 }
-ACCEPTED = ("seed", "batch_size")
+ACCEPTED = ("seed", "batch_size", "target_kl")
 
 
 def key_hint(name: str) -> str:
@@ -125,7 +133,21 @@ def flag_hint(argument: str, known: list[str], command: str | None) -> str:
             "; a resumed run computes what it began with: "
             "`sauna train --config RUN/config.json` trains anew with other settings"
         )
-    return _hint(name, flag) or nearest(typed, known)
+    near = nearest(typed.lstrip("-"), (other.lstrip("-") for other in known if other[:2] == "--"))
+    return _hint(name, flag) or near.replace("mean '", "mean '--")
+
+
+def spread_hint(arguments: Sequence[str], unknown: str) -> str:
+    """Writes `; ...` if an unknown argument is a further value of a list: `--seeds 0 1 2`."""
+    if unknown.startswith("-") or unknown not in arguments:
+        return ""
+    before = list(arguments[: arguments.index(unknown)])
+    options = [place for place, word in enumerate(before) if word.startswith("--")]
+    name = before[options[-1]].lstrip("-").replace("-", "_") if options else ""
+    if get_origin(TYPES.get(name, tuple[str] if name in ("arms", "rules") else None)) is not tuple:
+        return ""
+    values = [*takewhile(lambda word: not word.startswith("-"), arguments[options[-1] + 1 :])]
+    return f"; values of {flag(name)} are separated by commas: {flag(name)} {','.join(values)}"
 
 
 def _hint(name: str, spell: Any) -> str:

@@ -7,9 +7,16 @@ from __future__ import annotations
 
 ON_HOST = ("environments on the host", lambda c: c.backend != "device")
 WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
+TRACKED = ("track", lambda c: c.track != ("none",))
 PPO = ("algorithm ppo", lambda c: c.algorithm == "ppo")
 ADAM = ("optimizer adam", lambda c: c.optimizer == "adam")
 RMSPROP = ("optimizer rmsprop", lambda c: c.optimizer == "rmsprop")
+KL_RATE = ("learning_rate_schedule kl", lambda c: c.learning_rate_schedule == "kl")
+NO_KL_RATE = (
+    "a learning_rate_schedule other than kl",
+    lambda c: c.learning_rate_schedule != "kl",
+)
+ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
 VECTORS = (
@@ -34,15 +41,29 @@ RANDOM = ("filter random-drop", lambda c: c.filter == "random-drop")
 OWN_FILTER = ("a filter of your own, module:name", lambda c: ":" in c.filter)
 SAMPLER = ("a sampler", lambda c: c.sampler != "none")
 MASKED = (
-    "a sampler, or a filter with dropped=mask",
-    lambda c: c.sampler != "none" or (c.filter != "none" and c.dropped == "mask"),
+    "a sampler with selection_losses=all, or a filter with dropped=mask",
+    lambda c: (
+        (c.sampler != "none" and c.selection_losses == "all")
+        or (c.filter != "none" and c.dropped == "mask")
+    ),
 )
-STANDARDISED = ("normalize_advantages", lambda c: c.normalize_advantages)
+CENTRED = ("advantage_sign both", lambda c: c.advantage_sign == "both")
+STANDARDISED = (
+    "normalize_advantages, or advantage_sign positive",
+    lambda c: c.normalize_advantages or c.advantage_sign == "positive",
+)
+SQUARED = (
+    "algorithm ppo with critic squared",
+    lambda c: c.algorithm == "ppo" and c.critic == "squared",
+)
 WEIGHTED = ("a loss_weight", lambda c: c.loss_weight != "none")
 STOPPED = ("a stop rule", lambda c: c.stop != "none")
+UNSCHEDULED = ("constant", "kl")  # schedules that do not follow the budget
 SCHEDULED = (
-    "a schedule that is not constant",
-    lambda c: any(getattr(c, name) != "constant" for name in vars(c) if name.endswith("_schedule")),
+    "a schedule of the budget",
+    lambda c: any(
+        getattr(c, name) not in UNSCHEDULED for name in vars(c) if name.endswith("_schedule")
+    ),
 )
 EVALUATED = ("eval_every above 0", lambda c: c.eval_every > 0)
 FINE_TUNED = ("init_from", lambda c: bool(c.init_from))

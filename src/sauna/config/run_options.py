@@ -133,9 +133,17 @@ class RunOptions:
         resumable=True,
         machine_local=True,
     )
-    tensorboard: bool = _run(
-        False,
-        "also write the metrics for TensorBoard",
+    track: tuple[str, ...] = _run(
+        ("none",),
+        "where else the metrics go: tensorboard, wandb, trackio, mlflow, module:Class, or several",
+        resumable=True,
+        machine_local=True,
+        decided_by_study=True,
+    )
+    track_project: str = _run(
+        "sauna",
+        "the trackers' project or experiment",
+        read_when=readers.TRACKED,
         resumable=True,
         machine_local=True,
         decided_by_study=True,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 MAX_NAME = 100  # letters of a key
+IS_SUCCESS = "is_success"
 SUCCESS_RATE, INFO_PREFIX = "success_rate", "info_"  # of the metrics' keys
 
 
@@ -35,7 +36,7 @@ def info_means(infos: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 def info_key(name: str) -> str:
     """The metric of a number that environments give in `info`."""
-    return SUCCESS_RATE if name == "is_success" else INFO_PREFIX + name
+    return SUCCESS_RATE if name == IS_SUCCESS else INFO_PREFIX + name
 
 
 def is_metric_name(name: Any) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-REMOVED = ("drop_rate_from",)  # fields that 0.1.0 had: stored values are left out
+REMOVED = ("drop_rate_from", "tensorboard")  # fields that 0.1.0 had: stored values are left out
 _UNFILTERED = ("ppo", "vex-head")
 _VEX_COEF = 0.5  # the default of 0.1.0
 
@@ -36,5 +36,6 @@ def with_arms(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def without_removed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Leaves out stored settings of fields that exist no more."""
-    return {name: value for name, value in settings.items() if name not in REMOVED}
+    """Leaves out stored settings of fields that exist no more; `tensorboard` was a tracker."""
+    kept = {name: value for name, value in settings.items() if name not in REMOVED}
+    return {"track": ["tensorboard"], **kept} if settings.get("tensorboard") is True else kept

@@ -7,8 +7,9 @@ timing.jsonl    one row per iteration: seconds and steps/s (a clock's readings, 
 metrics.csv     both as one table; see metrics_csv.py
 summary.json    how each member ended
 checkpoints/    see checkpoint.py
+tracking.json   how each tracker finds its run again
 init/           a checkpoint of what the run started from, with init_from
-figures/, videos/, tensorboard/
+figures/, videos/, tensorboard/, wandb/
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.learner.optimizers import scaling
 from sauna.algorithm.learner.vex_targets import make_target
-from sauna.algorithm.policy.policy import check_collections, make_trunk
+from sauna.algorithm.policy.policy import Policy, check_collections, make_trunk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import make_program
 from sauna.algorithm.types import Hypers, ScoredStep, StepFilter
@@ -17,6 +18,7 @@ from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput, one_line
 from sauna.training.check_selection import check_selection, may_become
+from sauna.training.loop.schedules import check_schedules
 
 
 def check_plugins(config: Config, spaces: Spaces) -> None:
@@ -32,6 +34,8 @@ def check_plugins(config: Config, spaces: Spaces) -> None:
         if program.filter is not None:
             _check_filter(config, spaces, program.filter)
         _check_target(config)
+        check_optimizer(config, program.policy)
+        check_schedules(config)
         check_selection(config, spaces)
     except BadInput:
         raise
@@ -115,6 +119,26 @@ def _check_target(config: Config) -> None:
         raise BadInput(
             f"vex_target: {config.vex_target} gives shape {_shape(found)} instead of {shape}"
         )
+
+
+def check_optimizer(config: Config, policy: Policy) -> None:
+    """Makes the optimizer and traces one step.
+
+    Raises:
+      BadInput: it cannot be made, or its step or state are of another shape or type than before.
+    """
+    transform = scaling(config, policy)
+    params = jax.eval_shape(policy.init, jax.eval_shape(lambda: jax.random.key(0)))
+    try:
+        state = jax.eval_shape(transform.init, params)
+        step, after = jax.eval_shape(transform.update, params, state, params)
+    except Exception as error:  # an optimizer fails in its own way
+        text = one_line(error)[:160]
+        raise BadInput(f"optimizer: {config.optimizer} cannot make a step: {text}") from error
+    (old, structure), (new, other) = _flat(state), _flat(after)
+    same = structure == other and all(map(may_become, old, new))
+    if not same or (step.shape, step.dtype) != (params.shape, params.dtype):
+        raise BadInput(f"optimizer: {config.optimizer} gives other arrays than it began with")
 
 
 def _check_filter(config: Config, spaces: Spaces, filter: StepFilter) -> None:

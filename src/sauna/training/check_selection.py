@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any
 
 import jax
@@ -15,6 +16,12 @@ from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
 
+# Arguments that are read with continuous actions alone: by field, by rule.
+CONTINUOUS_ALONE: dict[str, dict[str, tuple[str, ...]]] = {
+    "loss_weight": {"delight": ("centred", "on")},
+    "sampler": {"kondo": ("centred",)},
+}
+
 
 def check_selection(config: Config, spaces: Spaces) -> None:
     """Makes the rules of the learner, and traces those that are the user's own.
@@ -23,17 +30,53 @@ def check_selection(config: Config, spaces: Spaces) -> None:
       BadInput: a rule cannot be made, or gives another shape or type than training needs.
     """
     rules = _rules(config, spaces)
+    _check_arguments(config, spaces)
     size = config.rollout_steps * config.envs // config.minibatches
     if rules.sampler is not None and ":" in config.sampler:
         plain = _rules(dataclasses.replace(config, control="none"), spaces).sampler
         assert plain is not None
         _check_sampler(config, spaces, plain)
         _trace(config, spaces, rules.sampler)  # as its control asks it
+    if rules.sampler is not None:
+        _check_draws(config, spaces, rules.sampler)
     if rules.loss_weight is not None and ":" in config.loss_weight:
         continuous = spaces.action_kind == "continuous"
         _check_weight(config.loss_weight, rules.loss_weight, size, continuous)
     if rules.stop is not None and ":" in config.stop:
         _check_stop(config.stop, rules.stop, size)
+    number, one = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((size,), ()))
+    if rules.objective is not None and ":" in config.objective:
+        terms = jax.eval_shape(rules.objective, number, number, one)
+        _check_array(f"objective: {config.objective}", "terms", terms, (size,), False)
+    if rules.critic is not None and ":" in config.critic:
+        loss = jax.eval_shape(rules.critic, number, number)
+        _check_array(f"critic: {config.critic}", "a loss", loss, (), False)
+
+
+def _check_arguments(config: Config, spaces: Spaces) -> None:
+    """Refuses arguments of a rule that it does not read with these actions."""
+    if spaces.action_kind == "continuous":
+        return
+    for field, names in CONTINUOUS_ALONE.items():
+        rule, given = getattr(config, field), json.loads(getattr(config, f"{field}_kwargs"))
+        for name in names.get(rule, ()):
+            if name in given:
+                raise BadInput(f"{field}_kwargs: {rule} reads {name} for continuous actions alone")
+
+
+def _check_draws(config: Config, spaces: Spaces, sampler: Sampler) -> None:
+    """Refuses settings that a sampler which draws by probabilities does not read."""
+    on_policy = config.selection_losses == "policy" and sampler.share < 1
+    if not on_policy and config.normalize_over != "kept":
+        return
+    if _trace(config, spaces, sampler)[2].probability is None:
+        return
+    if on_policy:
+        raise BadInput(
+            f"selection_losses: with policy, {config.sampler} draws as many rows as the rollout "
+            f"has, for the critic; leave out its share"
+        )
+    raise BadInput(f"normalize_over: {config.sampler} draws and keeps no set; use rollout")
 
 
 def _rules(config: Config, spaces: Spaces) -> Rules:

@@ -35,7 +35,7 @@ from sauna.training.empty_updates import EmptyUpdates
 from sauna.training.info_names import InfoNames
 from sauna.training.run import Run, resume_command
 from sauna.training.summary import METRIC, STOPS, summarize
-from sauna.training.tensorboard import TensorBoard
+from sauna.training.tracking.trackers import Trackers
 from sauna.training.worker import serve, write_job
 
 # Sees a row of `metrics.jsonl`; its member stops if it returns True.
@@ -47,7 +47,14 @@ MAX_LEAD = 64
 
 
 class Coordinator:
-    """The workers of one run and what they have sent but is not yet written."""
+    """The workers of one run and what they have sent but is not yet written.
+
+    Args:
+      initial: what a new run starts from, with `init_from`.
+      tracked: for each member the env steps up to which its rows were tracked before.
+      callback: see `Callback`.
+      draw: draws a figure of the run at its end; None if there is nothing to draw.
+    """
 
     def __init__(
         self,
@@ -56,9 +63,12 @@ class Coordinator:
         loaded: checkpoint.Checkpoint | None,
         initial: Mapping[str, np.ndarray],
         inexact: bool,
-        callback: Callback | None = None,
+        tracked: Mapping[str, int],
+        callback: Callback | None,
+        draw: Callable[[Path], Path | None] | None,
     ) -> None:
-        self._run, self._display, self._callback = run, display, callback
+        self._run, self._display = run, display
+        self._callback, self._draw = callback, draw
         self._stopped: dict[str, int] = {}  # by the callback: member, the iteration after its last
         self._iteration = loaded.manifest["iteration"] if loaded else 0
         self._parts = np.array_split(np.arange(len(run.members)), run.config.processes)
@@ -72,7 +82,6 @@ class Coordinator:
         self._lead, self._granted = LEAD, 0
         self._signal: int | None = None
         self._stopping = False
-        self._tensorboard = TensorBoard(run.path, run.config)
         self._empty_updates = EmptyUpdates()
         self._info_names = InfoNames(run_directory.rows(run.path))
         replay = not inexact and run.differs is None
@@ -81,6 +90,8 @@ class Coordinator:
         given = loaded.arrays if loaded else initial
         self._workers = [self._start(p, given, loaded is not None, replay) for p in self._parts]
         self._watchdog = Watchdog(self._workers)
+        done = tracked if replay else {}
+        self._trackers = Trackers(run.path, run.config, run.members, display.say, done)
 
     def _start(
         self, part: np.ndarray, given: Mapping[str, np.ndarray], is_restored: bool, replay: bool
@@ -117,7 +128,7 @@ class Coordinator:
         self._watchdog.close()
         for worker in self._workers:
             worker.stop(0.0 if error[0] else 5.0)
-        self._tensorboard.close()
+        self._trackers.close()
         self._display.close()
 
     def run(self) -> None:
@@ -131,11 +142,14 @@ class Coordinator:
         self._display.open(run.config, run.members, run.path, run_directory.rows(run.path))
         with handled(self._on_signal):
             self._grant()
+            self._trackers.open()  # while the workers compile
             while any(end is None for end in self._ended):
                 self._pump()
             complete = self._signal is None
             arrays = self._save(self._last_iteration(), self._logs.counted())
             self._write_summary(complete, arrays)
+        if self._draw is not None and (figure := self._draw(run.path)) is not None:
+            self._trackers.picture(figure.stem, figure)
         if not complete:
             raise Interrupted(
                 self._signal or 0,
@@ -310,7 +324,8 @@ class Coordinator:
         self._logs.append("metrics.jsonl", rows)
         self._logs.append("timing.jsonl", [timing])
         self._csv.append(rows, timing["wall_seconds"])
-        self._tensorboard.write(rows, timing)
+        clock = {name: timing[name] for name in ("steps_per_second", "wall_seconds")}
+        self._trackers.rows(rows, clock)
         if self._callback is not None:
             self._call(self._callback, rows)
 
@@ -331,11 +346,12 @@ class Coordinator:
     def _write_summary(self, complete: bool, arrays: Mapping[str, np.ndarray]) -> None:
         check_logs(self._run.path, {"iteration": self._iteration, **self._logs.counted()})
         members = summarize(run_directory.rows(self._run.path), arrays)
-        run_directory.write_json(
-            self._run.path / "summary.json",
-            {"complete": complete, "metric": METRIC, "members": members},
-        )
+        whole: dict[str, Any] = {"complete": complete, "metric": METRIC, "members": members}
+        if self._trackers.urls:
+            whole["tracking"] = self._trackers.urls
+        run_directory.write_json(self._run.path / "summary.json", whole)
         self._csv.sync()
+        self._trackers.summary(members, complete)
         self._display.summary(members)
 
 

@@ -1,10 +1,11 @@
-"""What a person sees while a run trains: a live table on a terminal, plain lines elsewhere."""
+"""What a person sees while a run trains: a live table, on a terminal or in a notebook, or lines."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Mapping
+from html import escape
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,6 +14,7 @@ from sauna.config.settings import Config
 from sauna.training.summary import with_evaluation
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
+NOTEBOOK_SECONDS = 0.5  # between two drawings of the table in a notebook
 NAMED = 6  # members that a progress line names; of more it gives the mean of each arm
 
 
@@ -44,8 +46,17 @@ class Display(Protocol):
 
 
 def make_display() -> Display:
-    """Makes a live table on a terminal, and plain lines elsewhere."""
+    """Makes a live table on a terminal and in a notebook, and plain lines elsewhere."""
+    if in_notebook():
+        return NotebookDisplay()
     return LiveDisplay() if sys.stdout.isatty() else PlainDisplay()
+
+
+def in_notebook() -> bool:
+    """Returns whether this process is the kernel of a notebook."""
+    module: Any = sys.modules.get("IPython")
+    shell = module.get_ipython() if module is not None else None
+    return getattr(shell, "kernel", None) is not None
 
 
 class _Progress:
@@ -81,6 +92,15 @@ class _Progress:
         """Counts the steps of a member's budget that are used."""
         row = self.latest[name]
         return row[f"{self.config.budget}_steps"] if row else 0
+
+    def cells(self) -> list[list[str]]:
+        """Writes the titles of the table, and a line for each member."""
+        columns = columns_of(self.members, self.succeeds)
+        lines = [
+            [name, *(number(row, key, form) for _, key, form in columns)]
+            for name, row in self.latest.items()
+        ]
+        return [["member", *(title for title, _, _ in columns)], *lines]
 
     def status(self) -> str:
         """Writes one line: phase or rate, time left."""
@@ -228,12 +248,11 @@ class LiveDisplay:
 
         assert self._progress is not None
         table = Table(title=self._progress.status(), title_justify="left", box=None)
-        table.add_column("member")
-        columns = columns_of(self._progress.members, self._progress.succeeds)
-        for title, _, _ in columns:
-            table.add_column(title, justify="right")
-        for name, row in self._progress.latest.items():
-            table.add_row(name, *(number(row, key, form) for _, key, form in columns))
+        head, *lines = self._progress.cells()
+        for title in head:
+            table.add_column(title, justify="left" if title == "member" else "right")
+        for line in lines:
+            table.add_row(*line)
         return table
 
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
@@ -248,6 +267,54 @@ class LiveDisplay:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+class NotebookDisplay(PlainDisplay):
+    """A table in a cell's output that is redrawn in place."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._handle: Any = None
+
+    def open(
+        self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
+    ) -> None:
+        from IPython.display import display
+
+        super().open(config, members, path, rows)
+        self._handle = display(self._html(), display_id=True)
+
+    def phase(self, process: int, text: str) -> None:
+        if self._progress is None:
+            super().phase(process, text)
+        else:
+            self._progress.phases[process] = text
+
+    def refresh(self) -> None:
+        if self._handle is not None and time.monotonic() - self._shown > NOTEBOOK_SECONDS:
+            self._shown = time.monotonic()
+            self._handle.update(self._html())
+
+    def summary(self, members: dict[str, dict[str, Any]]) -> None:
+        if self._handle is not None:
+            self._handle.update(self._html())
+        for name, row in members.items():
+            if text := evaluated(row):
+                self.say(f"{name}{text}")
+
+    def _html(self) -> Any:
+        from IPython.display import HTML
+
+        assert self._progress is not None
+        head, *lines = (
+            "".join(f"<td>{escape(cell)}</td>" for cell in line) for line in self._progress.cells()
+        )
+        body = "".join(f"<tr>{line}</tr>" for line in lines)
+        title = escape(self._progress.status())
+        return HTML(
+            f"<table><caption>{title}</caption><thead><tr>{head}</tr></thead>"
+            f"<tbody>{body}</tbody></table>"
+        )
 
 
 def evaluated(row: dict[str, Any]) -> str:

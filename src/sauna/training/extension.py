@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import RunConfig
+from sauna.config.readers import UNSCHEDULED
 from sauna.config.settings import Config, fields_with, to_json
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
@@ -62,9 +63,9 @@ def goes_further(before: Config, after: Config) -> bool:
 
 
 def schedules(config: Config) -> list[str]:
-    """Names the fields that schedule a rate."""
+    """Names the fields that schedule a rate over the budget."""
     names = [name for name in to_json(config) if name.endswith("_schedule")]
-    return [name for name in names if getattr(config, name) != "constant"]
+    return [name for name in names if getattr(config, name) not in UNSCHEDULED]
 
 
 def describe_extension(before: Config, after: Config) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from sauna.training.loop.job import Job
 
 MAX_STEPS = 2**31 - 1  # that the device's counters hold
+MAX_PREDICTED = 4096  # numbers that an auxiliary head predicts
 
 
 class Prepared(NamedTuple):
@@ -177,8 +179,14 @@ def check_own_parts(prepared: Prepared) -> None:
       BadInput: a part cannot be used.
     """
     config = prepared.config
-    numbers = (config.sampler_kwargs, config.loss_weight_kwargs, config.stop_kwargs)
+    numbers = (
+        config.sampler_kwargs,
+        config.loss_weight_kwargs,
+        config.stop_kwargs,
+        config.optimizer_kwargs,
+    )
     rules = any(text != "{}" for text in numbers) or config.control == "stride"
+    rules |= config.normalize_over == "kept" or config.selection_losses == "policy"
     if own_parts(config) or rules:
         configure_jax()
         from sauna.training.check_plugins import check_plugins
@@ -203,6 +211,12 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
         raise BadInput(
             f"network: {network} does not fit {spaces.observation_kind} observations of shape "
             f"{spaces.observation_shape}{least}"
+        )
+    predicted = math.prod(spaces.observation_shape)
+    if config.auxiliary != "none" and predicted > MAX_PREDICTED:
+        raise BadInput(
+            f"auxiliary: an observation has {predicted:,} numbers; a head predicts at most "
+            f"{MAX_PREDICTED:,}"
         )
     number = len(run.members)
     processes = config.processes or os.cpu_count() or 1

@@ -14,6 +14,7 @@ from typing import IO, Any
 
 from sauna.config.checks import cautions, check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
+from sauna.config.imported_from import KEY, folders_of, names_the_folder
 from sauna.config.own_sources import newer_sources
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
@@ -44,7 +45,7 @@ from sauna.training.prepare import (
     examine,
     place,
 )
-from sauna.training.tensorboard import TensorBoard
+from sauna.training.tracking.trackers import check_trackers
 
 
 class Run:
@@ -115,7 +116,7 @@ def start(
         placed = place(resolve_run(overrides))
         check_writes(placed.config)
         prepared = examine(placed, overrides, found)
-        TensorBoard.check(prepared.config)
+        check_trackers(prepared.config)
         check_own_parts(prepared)
         initial = read_initial(prepared, display.say, trust)
     path, made = _make_directory(prepared.config)
@@ -130,6 +131,8 @@ def start(
         "machine": run_directory.machine(),
         **({"initial": initial[1]} if initial else {}),
     }
+    if folders := folders_of(stored):
+        stored[KEY] = folders
     stored["seal"] = seal(stored)
     with disk_errors(path):
         run = Run(path, prepared, made)
@@ -205,9 +208,10 @@ def follow(overrides: Mapping[str, Any], display: Display) -> None:
     train_members(prepared.job(), Follower(display.say))
 
 
+@names_the_folder
 @kept_folder()
 def reopen(
-    path: Path,
+    path: str | Path,
     changes: Mapping[str, Any],
     display: Display,
     trust: bool = False,
@@ -241,7 +245,7 @@ def reopen(
     changed = before.replace(**parsed)
     check_extension(before.config, changed.config)
     check_consistent(changed.config)
-    TensorBoard.check(changed.config)
+    check_trackers(changed.config)
     changed = place(changed)
     check_writes(changed.config)
     if (changed.config.backend == "device") != (before.config.backend == "device"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from sauna.training.display import Display
 from sauna.training.extension import GOES_FURTHER
 from sauna.training.initial import load_initial
 from sauna.training.run import Run, disk_errors
+from sauna.training.tracking.trackers import chosen, last_steps
 
 
 def train_run(
@@ -29,11 +30,13 @@ def train_run(
     resume: bool,
     inexact: bool = False,
     callback: Callback | None = None,
+    draw: Callable[[Path], Path | None] | None = None,
 ) -> bool:
     """Trains a run to its end; returns when everything is written.
 
     Args:
       callback: sees each row of `metrics.jsonl`; its member stops if it returns True.
+      draw: draws a figure of the run at its end, for its trackers, too.
 
     Returns:
       False if it was complete already, so that nothing was done.
@@ -49,7 +52,7 @@ def train_run(
         if callback is not None and run.config.distributed:
             raise BadInput("callback: not called with distributed")
         with disk_errors(run.path):
-            return _train(run, display, resume, inexact, callback)
+            return _train(run, display, resume, inexact, callback, draw)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
             run_directory.discard(run.path, run.made)
@@ -59,17 +62,24 @@ def train_run(
 
 
 def _train(
-    run: Run, display: Display, resume: bool, inexact: bool, callback: Callback | None
+    run: Run,
+    display: Display,
+    resume: bool,
+    inexact: bool,
+    callback: Callback | None,
+    draw: Callable[[Path], Path | None] | None,
 ) -> bool:
-    loaded = None
+    loaded, tracked = None, {}
     if resume:
         if run_directory.is_complete(run.path) and _is_whole(run, display):
             display.say(f"{run.path} is complete; nothing to do")
             return False
         loaded = _load(run, display)
+        tracked = last_steps(run_directory.rows(run.path)) if chosen(run.config) else {}
         cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
     initial = load_initial(run.path, run.config) if loaded is None else {}
-    with Coordinator(run, display, loaded, initial, inexact, callback) as coordinator:
+    more = inexact, tracked, callback, draw
+    with Coordinator(run, display, loaded, initial, *more) as coordinator:
         coordinator.run()
     return True
 

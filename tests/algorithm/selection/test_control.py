@@ -1,4 +1,4 @@
-"""Matched controls: as many rows as the rule, chosen as numpy says; weights dealt anew."""
+"""Matched controls: as many rows as the rule, chosen as numpy says; weights given to other rows."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def minibatches(mode: str, keep: np.ndarray, order: np.ndarray) -> list[np.ndarr
     rows, number = _kept_first(jnp.asarray(keep), jnp.asarray(order))
     size = minibatch_size(mode, FULL, MINIBATCHES, ROWS)
     found = []
-    for i in range(int(minibatch_count(mode, number, FULL, MINIBATCHES))):
+    for i in range(int(minibatch_count(mode, number, size, MINIBATCHES))):
         places, counts = minibatch_places(mode, jnp.int32(i), number, size, MINIBATCHES)
         assert places.shape == counts.shape == (size,)
         found.append(np.asarray(rows)[np.asarray(places)][np.asarray(counts)])
@@ -97,6 +97,17 @@ def test_all_rows_make_ppos_own_minibatches_in_every_mode() -> None:
         np.testing.assert_array_equal(np.stack(got), order.reshape(MINIBATCHES, FULL))
 
 
+@given(st.integers(1, 60), st.integers(1, 600))
+def test_fewer_steps_take_hardly_a_row_twice(full: int, length: int) -> None:
+    """Of a static number of rows: as few steps as PPO's size allows, and less than one row each."""
+    size = minibatch_size("fewer", full, 4, length)
+    count = int(minibatch_count("fewer", jnp.int32(length), size, 4))
+    assert size <= full and count == -(-length // full)
+    assert 0 <= count * size - length < count
+    if length % full == 0:
+        assert size == full
+
+
 def test_a_draw_holds_as_many_rows_as_are_kept_or_asked_for() -> None:
     order = jnp.arange(ROWS, dtype=jnp.int32)[::-1]
     keep = jnp.arange(ROWS) % 3 == 0
@@ -104,6 +115,10 @@ def test_a_draw_holds_as_many_rows_as_are_kept_or_asked_for() -> None:
     assert some.number == 8 and some.rows.shape == (10,)
     np.testing.assert_array_equal(some.rows[:8], np.arange(21, -1, -3))
     np.testing.assert_array_equal(some.rows, some.value_rows)
+    turned = jnp.array([3, 9, 1, 0, 7, 2, 8, 6, 5, 4], jnp.int32)  # of the first ten kept rows
+    few = draw(Choice(keep=keep), turned, jax.random.key(0), 10)
+    assert few.number == 8, "places 8 and 9 hold rows that are not kept: they come last"
+    np.testing.assert_array_equal(few.rows[:8], 3 * np.array([3, 1, 0, 7, 2, 6, 5, 4]))
     p = jnp.ones(ROWS) / ROWS
     drawn = draw(Choice(probability=p), order, jax.random.key(0), 10)
     assert drawn.number == 10

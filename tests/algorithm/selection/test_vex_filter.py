@@ -28,8 +28,9 @@ from sauna.algorithm.selection.vex_filter import (
 )
 from sauna.algorithm.types import StepFilter
 from sauna.system.errors import BadInput
-from sauna.training.loop.budget import hypers_now, scheduled
+from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters
+from sauna.training.loop.schedules import shaped
 
 
 def run(
@@ -224,9 +225,9 @@ def test_the_threshold_that_is_told_would_keep_the_rate() -> None:
 
 
 def test_a_schedule_is_linear_in_what_is_left() -> None:
-    assert [scheduled(0.8, "constant", left) for left in (1.0, 0.25)] == [0.8, 0.8]
-    np.testing.assert_allclose([scheduled(0.8, "rising", x) for x in (1, 0.25, 0)], [0, 0.6, 0.8])
-    np.testing.assert_allclose([scheduled(0.8, "falling", x) for x in (1, 0.25)], [0.8, 0.2])
+    assert [shaped(0.8, "constant", left) for left in (1.0, 0.25)] == [0.8, 0.8]
+    np.testing.assert_allclose([shaped(0.8, "rising", x) for x in (1, 0.25, 0)], [0, 0.6, 0.8])
+    np.testing.assert_allclose([shaped(0.8, "falling", x) for x in (1, 0.25)], [0.8, 0.2])
 
 
 @pytest.mark.parametrize(

@@ -99,5 +99,6 @@ def test_what_is_no_rule_is_no_arm(name: str) -> None:
 
 
 def test_the_command_of_a_study_that_names_code_says_trust() -> None:
-    assert study_command("mine.toml", "runs", names_code=True) == "sauna study mine.toml --trust"
-    assert study_command("table1", "runs") == "sauna study table1"
+    text = {"tasks": ["Hopper-v5"], "arms": [{"label": "x", "arm": "ppo", "sampler": NEWEST}]}
+    assert study_command("mine.toml", "runs", text) == "sauna study mine.toml --trust"
+    assert study_command("table1", "runs", {"tasks": ["A-v0"]}) == "sauna study table1"

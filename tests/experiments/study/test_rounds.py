@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from helpers import SMALL
+from command_line import sauna, small_flags
+from helpers import SMALL, environment
 from sauna.api import compare
+from sauna.config.arms import RULE_HELP
 from sauna.config.presets import COMPARED
 from sauna.experiments.sequential import DESIGN, capped, replay, tournament
 from sauna.experiments.study.command import (
@@ -303,3 +309,45 @@ def test_a_tournament_is_trained_and_run_again_trains_nothing(tmp_path: Path) ->
     before = {path: path.stat().st_mtime_ns for path in (out / "units").rglob("metrics.jsonl")}
     assert compare("CartPole-v1", rules=rules, out=out, quiet=True, **settings) == summary
     assert before == {p: p.stat().st_mtime_ns for p in (out / "units").rglob("metrics.jsonl")}
+
+
+@pytest.mark.slow
+def test_a_tournament_of_all_rules_goes_on_after_a_signal_to_the_same_result(
+    tmp_path: Path,
+) -> None:
+    """Of three seeds each; the signal comes once the first unit is complete."""
+    flags = ["--arms", "all", "--processes=2", *small_flags(seeds=3)]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    command = ["compare", "worlds:Scripted", *flags, "--out"]
+    done = sauna(*command, str(whole))
+    assert done.returncode == 0, done.stderr
+    started = subprocess.Popen(
+        [sys.executable, "-m", "sauna", *command, str(cut)],
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 300
+    while not list((cut / "units").glob("*/summary.json")):
+        assert started.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    started.send_signal(signal.SIGTERM)
+    assert started.wait(120) == 143
+    expected, before = rows_of(whole), rows_of(cut)
+    assert 0 < sum(before.get(name) == rows for name, rows in expected.items()) < len(expected)
+    done = sauna(*command, str(cut))
+    assert done.returncode == 0, done.stderr
+    assert rows_of(cut) == expected and len(expected) >= len(RULE_HELP) + 1
+    one, other = (
+        json.loads(next(out.glob("compare_*/summary.json")).read_text()) for out in (whole, cut)
+    )
+    for part in ("ranking", "table", "verdicts"):
+        assert one[part] == other[part], part
+
+
+def rows_of(out: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted((out / "units").rglob("metrics.jsonl"))
+    }

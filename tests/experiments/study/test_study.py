@@ -244,7 +244,7 @@ def folder_of(out: Path) -> Path:
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("compared")
-    done = sauna("compare", "worlds:Scripted", "--out", str(out), *FLAGS)
+    done = sauna_here("compare", "worlds:Scripted", "--out", str(out), *FLAGS)
     assert done.returncode == 0, done.stderr
     (out / "stdout.txt").write_text(done.stdout)
     return out
@@ -282,6 +282,18 @@ def test_the_control_begins_as_its_arm_does_and_learns_otherwise(compared: Path)
         arm, control = rows["sauna", seed], rows["sauna+random", seed]
         assert arm[0]["keep_rate"] == control[0]["keep_rate"]
         assert arm[-1]["policy_loss"] != control[-1]["policy_loss"]
+
+
+def test_in_processes_as_a_user_starts_them_the_rows_are_the_same(
+    compared: Path, tmp_path: Path
+) -> None:
+    flags = [*small_flags(seeds=2), "--processes=1", "--arms=ppo"]
+    done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *flags)
+    assert done.returncode == 0, done.stderr
+    expected, got = rows_of(compared), rows_of(tmp_path)
+    assert len(got) == 1
+    for name, rows in got.items():
+        assert rows == expected[name]
 
 
 def stamps(out: Path) -> dict[Path, int]:

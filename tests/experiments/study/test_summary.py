@@ -114,7 +114,8 @@ def test_better_worse_and_no_evidence() -> None:
 def test_what_a_sampler_leaves_out_is_shown() -> None:
     top = cell("top-advantage", HIGH, sample_rate=0.5)
     top["config"] = {"sampler": "top-advantage"}
-    top["members"][0]["curve"]["sample_rate"] = [0.5] * 3
+    for of_seed in top["members"]:
+        of_seed["curve"]["sample_rate"] = [0.5] * 3
     plain = results(cell("ppo", LOW, sample_rate=1.0))
     sampled = results(cell("ppo", LOW, sample_rate=1.0), top)
     head, ppo, rule = lines(summarize(sampled))[:3]
@@ -122,14 +123,17 @@ def test_what_a_sampler_leaves_out_is_shown() -> None:
     assert "1.000      1.000" in ppo
     assert "samples used" not in lines(summarize(plain))[0]
     page = make_page(sampled, summarize(sampled))
-    assert page.count("Samples used</th>") == 3 and "0.500" in page  # the table, and two of seeds
+    assert page.count("Samples used</th>") == 3 and "0.500" in page  # also of the seeds
     assert make_page(plain, summarize(plain)).count("Samples used</th>") == 1
-    drawn = {
-        p.name: [x.label for x in p.panels[0].lines] for p in plots_of(sampled, summarize(sampled))
-    }
-    assert drawn["keep_rate"] == ["ppo", "top-advantage"] and drawn["samples_used"] == [
-        "top-advantage"
-    ]
+    drawn = _drawn(sampled)
+    assert drawn["keep_rate"] == ["ppo", "top-advantage"]
+    assert drawn["samples_used"] == ["top-advantage"]
+
+
+def _drawn(found: dict[str, Any]) -> dict[str, list[str]]:
+    """The labels in the first panel of each figure."""
+    plots = plots_of(found, summarize(found))
+    return {plot.name: [line.label for line in plot.panels[0].lines] for plot in plots}
 
 
 def test_a_head_that_is_not_trained_is_not_drawn() -> None:
@@ -139,10 +143,7 @@ def test_a_head_that_is_not_trained_is_not_drawn() -> None:
         for of_seed in one["members"]:
             of_seed["curve"]["vex_mean"] = [0.1, 0.2, 0.3]
     found = results(ppo, head)
-    drawn = {
-        p.name: [x.label for x in p.panels[0].lines] for p in plots_of(found, summarize(found))
-    }
-    assert drawn["vex"] == ["vex-head"]
+    assert _drawn(found)["vex"] == ["vex-head"]
 
 
 def test_no_difference_at_all_names_no_number_of_seeds() -> None:
@@ -158,14 +159,14 @@ def test_too_few_seeds_says_how_many() -> None:
         "least 4 of each are needed."
     )
     one = verdict(cell("ppo", LOW), cell("sauna", HIGH[:1], keep_rate=0.7))["text"]
-    assert "1 against 6 ended; at least 4 of each are needed." in one
+    assert "1 and 6 seeds have ended; at least 4 of each are needed." in one
 
 
 def test_nothing_to_compare_with() -> None:
     for cells in [[cell("sauna", HIGH)], [cell("ppo", []), cell("sauna", HIGH)]]:
         summary = summarize(results(*cells))
         assert summary["verdicts"][0]["kind"] == "underpowered"
-        assert "6 against 0 ended; at least 4 of each" in summary["verdicts"][0]["text"]
+        assert "6 and 0 seeds have ended; at least 4 of each" in summary["verdicts"][0]["text"]
         assert summary["table"][-1]["improvement"] == [None, None, None]
     assert summarize(results(cell("ppo", LOW)))["verdicts"] == []
     assert summarize(results())["table"] == []

@@ -15,6 +15,7 @@ from sauna.algorithm.learner.metrics import (
     policy_std,
     variance_explained,
 )
+from sauna.algorithm.learner.optimizers import moves_rate
 from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
 from sauna.algorithm.learner.update import Parts, loss_advantage, update_on_all, vex_targets
 from sauna.algorithm.selection.vex_filter import moved_threshold
@@ -66,6 +67,7 @@ def learn(
         mean_target,
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
+        state.learning_rate if moves_rate(config) else jnp.float32(jnp.nan),
         policy_std(parts.policy.unravel(state.params)),
         is_finite & jnp.all(jnp.isfinite(state.params)),
         work,

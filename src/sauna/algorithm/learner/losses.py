@@ -101,14 +101,8 @@ def weigh_policy(
     if rules.loss_weight is None:
         return log_ratio, minibatch.policy_mask, minibatch.policy_scale, None
     rows = minibatch.rows
-    change = jnp.where(rows.weight > 0, log_prob - rows.log_prob, 0.0)
-    terms = LossTerms(
-        jax.lax.stop_gradient(log_prob),
-        jax.lax.stop_gradient(change),
-        minibatch.advantage,
-        jax.lax.stop_gradient(entropy),
-        minibatch.policy_mask,
-        distribution.has_log_std,
+    terms = loss_terms(
+        rows, minibatch.advantage, minibatch.policy_mask, log_prob, entropy, distribution
     )
     scale: Any
     mask, scale = rules.loss_weight.weight(terms)
@@ -122,6 +116,26 @@ def weigh_policy(
     if minibatch.policy_scale is not None:
         scale = minibatch.policy_scale if scale is None else scale * minibatch.policy_scale
     return log_ratio, mask, scale, effective
+
+
+def loss_terms(
+    rows: Batch,
+    advantage: Array,
+    present: Array,
+    log_prob: Array,
+    entropy: Array,
+    distribution: Distribution,
+) -> LossTerms:
+    """What a loss weight sees of `B` rows: constants for the gradient, `[B]` each."""
+    change = jnp.where(rows.weight > 0, log_prob - rows.log_prob, 0.0)
+    return LossTerms(
+        jax.lax.stop_gradient(log_prob),
+        jax.lax.stop_gradient(change),
+        advantage,
+        jax.lax.stop_gradient(entropy),
+        present,
+        distribution.has_log_std,
+    )
 
 
 def scale_gradient(x: Array, scale: Array) -> Array:

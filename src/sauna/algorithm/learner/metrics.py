@@ -39,6 +39,7 @@ class UpdateMetrics(NamedTuple):
     vex_spread: Array  # their standard deviation
     vex_median: Array
     threshold: Array  # where it moves: that of this iteration; else NaN
+    learning_rate: Array  # if the KL divergence moves it: that of the last step; else NaN
     policy_std: Array  # mean over the action's components, after the update; NaN if discrete
     finite: Array  # bool: parameters and losses are finite
     work: Work

@@ -76,13 +76,14 @@ def update_on_selected(
 
     Args:
       batch: `[M]` samples; rollout: where they are from.
-      order: `[epochs, M]` int32, a permutation for each epoch.
+      order: `[epochs, M]` int32, a permutation for each epoch; or of the first K = `drawn_length`
+        rows that are kept.
       key: of this iteration's draws.
     """
     sampler = parts.rules.sampler
     choice = None
     if sampler is None or not sampler.each_epoch:
-        state, choice = choose(state, batch, jax.random.fold_in(key, 0), parts=parts)
+        state, choice = choose(state, batch, choice_key(key), parts=parts)
 
     def not_last(carry: tuple[Array, TrainState, Totals]) -> Array:
         return (carry[0] < parts.config.epochs) & ~carry[2].stopped
@@ -90,18 +91,43 @@ def update_on_selected(
     def epoch(carry: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
         e, state, totals = carry
         now, chosen = batch, choice
-        epoch_key = jax.random.fold_in(key, e + 1)
         if parts.config.recompute_advantages:
             value = parts.policy.apply(state.params, rollout.observation).value
             now = recomputed(batch, rollout, value, hypers, config=parts.config)
         if chosen is None:
-            state, chosen = choose(state, now, jax.random.fold_in(epoch_key, 2), parts=parts)
-        state, totals = _epoch(state, totals, now, chosen, hypers, order[e], epoch_key, parts=parts)
+            state, chosen = choose(state, now, choice_key(key, e), parts=parts)
+        own = epoch_key(key, e)
+        state, totals = _epoch(state, totals, now, chosen, hypers, order[e], own, parts=parts)
         return e + 1, state, totals
 
     start = (jnp.int32(0), state, _no_totals())
     _, state, totals = jax.lax.while_loop(not_last, epoch, start)
     return state, totals
+
+
+def epoch_key(key: Array, epoch: Any) -> Array:
+    """The key of an epoch's draws, from that of the iteration's."""
+    return jax.random.fold_in(key, epoch + 1)
+
+
+def choice_key(key: Array, epoch: Any = None) -> Array:
+    """The key of a choice that is made before all epochs, or before one of them."""
+    return (
+        jax.random.fold_in(key, 0)
+        if epoch is None
+        else jax.random.fold_in(epoch_key(key, epoch), 2)
+    )
+
+
+def first_draw(
+    state: TrainState, batch: Batch, order: Array, key: Array, *, parts: Parts
+) -> tuple[TrainState, Choice, Draw]:
+    """What the first epoch of an update learns from; arguments as of `update_on_selected`."""
+    sampler = parts.rules.sampler
+    each_epoch = sampler is not None and sampler.each_epoch
+    own = choice_key(key, 0) if each_epoch else choice_key(key)
+    state, choice = choose(state, batch, own, parts=parts)
+    return state, choice, _drawn(choice, batch, order[0], epoch_key(key, 0), parts)
 
 
 def choose(
@@ -171,9 +197,10 @@ def _epoch(
 ) -> tuple[TrainState, Totals]:
     config = parts.config
     drawn = _drawn(choice, batch, order, key, parts)
-    mode, full = config.selection_mode, len(order) // config.minibatches
+    mode = config.selection_mode
+    full = config.rollout_steps * config.envs // config.minibatches
     size = minibatch_size(mode, full, config.minibatches, drawn_length(parts))
-    steps = minibatch_count(mode, drawn.number, full, config.minibatches)
+    steps = minibatch_count(mode, drawn.number, size, config.minibatches)
     kept = drawn.number
     if choice.probability is None:
         kept = jnp.sum(choice.keep, dtype=jnp.int32)

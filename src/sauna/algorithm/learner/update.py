@@ -11,6 +11,7 @@ import optax
 
 from sauna.algorithm.learner import a2c, ppo
 from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
+from sauna.algorithm.learner.optimizers import moved_rate, moves_rate, optimizer, scaling
 from sauna.algorithm.learner.vex_targets import VexTarget
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.selection.positive import cut_at_zero
@@ -28,29 +29,12 @@ class Parts(NamedTuple):
     rules: Rules
 
 
-def scaling(config: Config) -> optax.GradientTransformation:
-    """Adam or RMSProp without the step size (which is traced).
-
-    RMSProp is TensorFlow's, as in baselines: the mean square starts at 1, epsilon is under the
-    root.
-    """
-    if config.optimizer == "rmsprop":
-        return optax.scale_by_rms(
-            config.rmsprop_decay, config.rmsprop_epsilon, initial_scale=1.0, eps_in_sqrt=True
-        )
-    return optax.scale_by_adam(eps=config.adam_epsilon)
-
-
-def optimizer(config: Config, hypers: Hypers) -> optax.GradientTransformation:
-    """Global-norm clipping, then the optimizer's scaling."""
-    return optax.chain(optax.clip_by_global_norm(hypers.max_grad_norm), scaling(config))
-
-
 def init_state(parts: Parts, key: Array) -> TrainState:
-    params = parts.policy.init(key)
-    sampler = parts.rules.sampler
+    config, policy, sampler = parts.config, parts.policy, parts.rules.sampler
+    params = policy.init(key)
     carried = sampler.init() if sampler else ()
-    return TrainState(params, scaling(parts.config).init(params), carried)
+    rate = jnp.float32(0.0) if moves_rate(config) else ()
+    return TrainState(params, scaling(config, policy).init(params), carried, rate)
 
 
 def vex_targets(batch: Batch, target: VexTarget) -> Array:
@@ -122,10 +106,14 @@ def gradient_step(
         return losses.total, losses
 
     gradient, losses = jax.grad(loss, has_aux=True)(state.params)
-    transform = optimizer(parts.config, hypers)
-    step, (_, scale) = transform.update(gradient, (optax.EmptyState(), state.optimizer))
-    params = state.params - hypers.learning_rate * step
-    return TrainState(params, scale, state.sampler), losses, jnp.linalg.norm(gradient)
+    transform = optimizer(parts.config, parts.policy, hypers)
+    before = (optax.EmptyState(), state.optimizer)
+    step, (_, scale) = transform.update(gradient, before, state.params)
+    rate, carried = hypers.learning_rate, state.learning_rate
+    if moves_rate(parts.config):
+        rate = carried = moved_rate(jnp.where(carried > 0, carried, rate), losses.kl, parts.config)
+    params = state.params - rate * step
+    return TrainState(params, scale, state.sampler, carried), losses, jnp.linalg.norm(gradient)
 
 
 def update_on_all(
@@ -161,8 +149,11 @@ def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
     return generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)
 
 
-def device_minibatch_order(config: Config, key: Array) -> Array:
-    """The order of the samples in every epoch `[epochs, T * N]`."""
-    number = config.rollout_steps * config.envs
+def device_minibatch_order(config: Config, key: Array, length: int | None = None) -> Array:
+    """The order of the samples in every epoch `[epochs, T * N]`, or of the first `length` rows.
+
+    A permutation is a sort here, so that one of fewer rows takes less time.
+    """
+    number = length or config.rollout_steps * config.envs
     keys = jax.random.split(key, config.epochs)
     return jax.vmap(lambda key: jax.random.permutation(key, number))(keys)

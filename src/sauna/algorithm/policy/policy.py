@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -110,7 +111,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         distribution.num_outputs,
         config.log_std_init if distribution.has_log_std else None,
         config.trunk == "shared",
-        0 if config.auxiliary == "none" else spaces.observation_shape[0],
+        0 if config.auxiliary == "none" else math.prod(spaces.observation_shape),
     )
     example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
     variables = jax.eval_shape(network.init, jax.random.key(0), example)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import MAX_STEPS
@@ -16,6 +15,7 @@ from sauna.algorithm.types import Array
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv
 from sauna.envs.host.answers import one_number, reset_with
+from sauna.envs.info import IS_SUCCESS, SUCCESS_RATE, numbers_of
 
 _RESET = 2**31  # apart from the numbers of env steps, whose keys draw the actions
 
@@ -26,10 +26,11 @@ class Episode(NamedTuple):
     return_: float  # of raw rewards
     length: int  # env steps
     cut: bool  # whether it had not ended
+    success: float | None = None  # `is_success` of the last `info`; None if that does not say
 
 
 def play(
-    policy: FrozenPolicy,
+    policy: Callable[..., Any],
     env: Any,
     deterministic: bool,
     seed: int,
@@ -39,20 +40,28 @@ def play(
     """Plays one episode, cut after `max_steps` env steps.
 
     Args:
+      policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes.
       watch: called after the reset and after each env step.
     """
     key = jax.random.key(seed)
     observation = reset_with(env, seed)
     watch()
-    return_, length, ended = 0.0, 0, False
+    return_, length, ended, info = 0.0, 0, False, None
     while not ended and length < max_steps:
         step_key = None if deterministic else jax.random.fold_in(key, length)
         action = policy(observation, deterministic=deterministic, key=step_key)
-        observation, reward, terminated, truncated, _ = env.step(action)
+        observation, reward, terminated, truncated, info = env.step(action)
         return_, length = return_ + one_number(reward), length + 1
         ended = bool(terminated or truncated)
         watch()
-    return Episode(return_, length, not ended)
+    success = numbers_of(info).get(IS_SUCCESS) if ended else None
+    return Episode(return_, length, not ended, success)
+
+
+def success_rate(episodes: Sequence[Episode]) -> dict[str, float]:
+    """The mean over those that say whether they were a success, by its name; {} if none does."""
+    known = [episode.success for episode in episodes if episode.success is not None]
+    return {SUCCESS_RATE: sum(known) / len(known)} if known else {}
 
 
 class Played(NamedTuple):
@@ -61,6 +70,7 @@ class Played(NamedTuple):
     return_: Array  # [E] float32, of raw rewards
     length: Array  # [E] int32
     cut: Array  # [E] bool, whether it had not ended
+    success: Array  # [E] float32; NaN if that is not known
 
 
 class _Now(NamedTuple):
@@ -70,6 +80,7 @@ class _Now(NamedTuple):
     return_: Array
     length: Array
     ended: Array
+    success: Array
 
 
 def play_on_device(
@@ -105,6 +116,7 @@ def play_on_device(
     def step(now: _Now) -> _Now:
         transition = jax.vmap(env.step)(now.state, act(now))
         running = ~now.ended
+        success = dict(transition.info).get(IS_SUCCESS, jnp.nan)
         return _Now(
             now.t + 1,
             transition.state,
@@ -112,12 +124,20 @@ def play_on_device(
             now.return_ + jnp.where(running, transition.reward, 0.0),
             now.length + running,
             now.ended | transition.terminated | transition.truncated,
+            jnp.where(running, success, now.success),
         )
 
     state, observation = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, _RESET)))(keys)
     zeros = jnp.zeros(len(keys), jnp.float32)
     first = _Now(
-        jnp.int32(0), state, observation, zeros, zeros.astype(jnp.int32), zeros.astype(bool)
+        jnp.int32(0),
+        state,
+        observation,
+        zeros,
+        zeros.astype(jnp.int32),
+        zeros.astype(bool),
+        zeros + jnp.nan,
     )
     last = jax.lax.while_loop(lambda now: (now.t < max_steps) & ~jnp.all(now.ended), step, first)
-    return Played(last.return_, last.length, ~last.ended)
+    success = jnp.where(last.ended, last.success, jnp.nan)
+    return Played(last.return_, last.length, ~last.ended, success)

@@ -27,7 +27,7 @@ def draw(choice: Choice, permutation: Array, key: Array, length: int) -> Draw:
     """
     number = jnp.int32(length)
     if choice.probability is None:
-        index, number = kept_first(choice.keep, permutation)
+        index, number = kept_in_order(choice.keep, permutation)
         index, number = index[:length], jnp.minimum(number, length)
     else:
         index = by_probability(choice.probability, jax.random.uniform(key, (length,)))
@@ -36,6 +36,21 @@ def draw(choice: Choice, permutation: Array, key: Array, length: int) -> Draw:
         other = jax.random.uniform(jax.random.fold_in(key, 1), (length,))
         value_index = by_probability(choice.value_probability, other)
     return Draw(index, value_index, number)
+
+
+def kept_in_order(keep: Array, permutation: Array) -> tuple[Array, Array]:
+    """Puts the kept rows first, in the order of a permutation of all rows or of that many of them.
+
+    Returns:
+      as many rows as the permutation has, and how many of them are kept.
+    """
+    length = len(permutation)
+    if length == len(keep):
+        return kept_first(keep, permutation)
+    rows, number = kept_first(keep, jnp.arange(len(keep), dtype=permutation.dtype))
+    number = jnp.minimum(number, length)
+    places, _ = kept_first(jnp.arange(length) < number, permutation)
+    return rows[places], number
 
 
 def kept_first(keep: Array, permutation: Array) -> tuple[Array, Array]:
@@ -61,14 +76,20 @@ def by_probability(probability: Array, uniform: Array) -> Array:
 
 
 def minibatch_size(mode: str, full: int, minibatches: int, length: int) -> int:
-    """Gives the rows of one minibatch; `full` is PPO's own size."""
-    return math.ceil(length / minibatches) if mode == "smaller" else full
+    """Gives the rows of one minibatch; `full` is PPO's own size.
+
+    `length` rows that do not fill whole minibatches of PPO's size are shared out evenly, so that
+    hardly a row goes through the network only to fill the last one.
+    """
+    if mode == "smaller":
+        return math.ceil(length / minibatches)
+    return math.ceil(length / math.ceil(length / full)) if mode == "fewer" else full
 
 
-def minibatch_count(mode: str, number: Array, full: int, minibatches: int) -> Array:
+def minibatch_count(mode: str, number: Array, size: int, minibatches: int) -> Array:
     """Gives the gradient steps of one epoch that has drawn `number` rows; none for 0 rows."""
     if mode == "fewer":
-        return (number + full - 1) // full
+        return (number + size - 1) // size
     if mode == "smaller":
         return jnp.minimum(number, minibatches)
     return jnp.where(number > 0, minibatches, 0)
@@ -81,7 +102,7 @@ def minibatch_places(
 
     | mode | minibatches | a minibatch |
     |---|---|---|
-    | `fewer` | as many as the rows fill | PPO's size; the last is filled from the front |
+    | `fewer` | as many as the rows fill | at most PPO's size; the last is filled from the front |
     | `smaller` | as many as without a rule, at most one a row | an equal share of the rows |
     | `refill` | as many as without a rule | PPO's size; the rows are gone through again |
     """

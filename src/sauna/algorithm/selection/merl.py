@@ -10,7 +10,11 @@ MIN_SQUARE = 1e-12  # of a norm: a vector of zeros has no direction, and no NaN
 
 
 def cosine_distance(prediction: Array, target: Array) -> Array:
-    """`1 - cos(prediction, target)` over the last axis, `[B]`."""
+    """`1 - cos(prediction, target)` of `[B, O]`, `[B]`; a target `[B, *obs]` is made flat.
+
+    A target's unit does not count, so that bytes stay what they are.
+    """
+    target = target.reshape((len(target), -1)).astype(prediction.dtype)
     squares = [jnp.maximum(jnp.sum(x**2, -1), MIN_SQUARE) for x in (prediction, target)]
     return 1.0 - jnp.sum(prediction * target, -1) / jnp.sqrt(squares[0] * squares[1])
 
@@ -24,7 +28,7 @@ def next_observation(
     arXiv 1909.11939, which trains this head beside one for explained variance.
 
     Args:
-      prediction, observation, following: `[B, obs]`; weight: `[B]`.
+      prediction: `[B, O]`; observation, following: `[B, *obs]` of O numbers; weight: `[B]`.
     """
     distance = cosine_distance(prediction, following)
     return jnp.sum(distance * weight) / jnp.maximum(jnp.sum(weight), 1.0)

@@ -97,8 +97,8 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
     return Rules(
         sampler=sampler,
         loss_weight=weight,
-        objective=OBJECTIVES[config.objective],
-        critic=CRITICS[config.critic],
+        objective=_function("objective", config.objective, OBJECTIVES),
+        critic=_function("critic", config.critic, CRITICS),
         stop=_made("stop", config.stop, STOPS, StopRule, config.stop_kwargs),
         auxiliary=AUXILIARY[config.auxiliary],
     )
@@ -129,6 +129,18 @@ def _made(
         raise BadInput(f"{field}_kwargs: {name} is a rule already and takes none")
     if not isinstance(made, kind):
         raise BadInput(f"{field}: {name} is not a sauna.{kind.__name__}")
+    return made
+
+
+def _function(field: str, name: str, known: Mapping[str, Any]) -> Any:
+    """The function of that name; None for PPO's own.
+
+    Raises:
+      BadInput: a user's `module:name` is something else.
+    """
+    made = known[name] if name in known else import_name(field, name)
+    if made is not None and not callable(made):
+        raise BadInput(f"{field}: {name} is not a function")
     return made
 
 

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.play import Progress
-from sauna.experiments.evaluate.video import record_video
+from sauna.experiments.evaluate.video import check_drawn, record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.working_folder import kept_folder
@@ -39,6 +40,7 @@ class VideoFailure(SaunaError):
         self.result = result
 
 
+@names_the_folder
 @kept_folder()
 def evaluate(
     run: str | Path,
@@ -82,8 +84,8 @@ def evaluate(
       `{"mode", "env", "seed", "members": {name: {"returns", "lengths", "mean", ...}}}`.
 
     Raises:
-      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces, or
-        with `best`, a member was not evaluated during training.
+      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces; with
+        `best`, a member was not evaluated during training; with `video`, `env` has no pictures.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
     run = Path.cwd() / run  # an environment may go elsewhere
@@ -105,9 +107,11 @@ def evaluate(
     kwargs = kwargs_of(artifact, env, env_kwargs)
     if env_kwargs:
         result["env_kwargs"] = kwargs
+    if video:
+        check_drawn(result["env"], kwargs)
     made = make_env(result["env"], kwargs)
     check_spaces(artifact, made)
-    from sauna.algorithm.rollout.play import play  # imports JAX, so after the checks
+    from sauna.algorithm.rollout.play import play, success_rate  # imports JAX: after the checks
     from sauna.experiments.evaluate.policy import TrainedPolicy
 
     for name in chosen:
@@ -117,7 +121,7 @@ def evaluate(
             progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
             for i in range(episodes)
         ]
-        result["members"][name] = statistics(played)
+        result["members"][name] = statistics(played) | success_rate(played)
         progress.say_cut(max_steps)
     close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
@@ -190,5 +194,6 @@ def report(result: dict[str, Any]) -> list[str]:
             f"(min {row['min']:.2f}, median {row['median']:.2f}, max {row['max']:.2f}), "
             f"length {row['length_mean']:.1f} ({row['length_min']} to {row['length_max']}), "
             f"{row['episodes']} episodes"
+            + (f", success {row['success_rate']:.0%}" if "success_rate" in row else "")
         )
     return lines

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,11 +18,11 @@ from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.artifact import Artifact, best_of, check_spaces, find_member
 from sauna.training.loop.member_state import fitting, flat_params, under
 
-CHUNK = 512  # observations of one call of `predict`: one compiled shape, and bounded memory
+CHUNK = 512  # observations of one call of `heads`: one compiled shape, and bounded memory
 
 
 class TrainedPolicy(FrozenPolicy):
-    """`policy(observation) -> action` for one raw observation of the environment.
+    """`policy(observation) -> action` for a raw observation of the environment, or a batch.
 
     The action is the distribution's mode unless `deterministic=False` and a key are given.
 
@@ -50,8 +52,8 @@ class TrainedPolicy(FrozenPolicy):
         super().__init__(config, artifact.spaces, env)
         if made:
             close(env)
-        example = jax.eval_shape(self._policy.init, jax.random.key(0))
-        params = flat_params(self._policy, example, under("params/", own))
+        example = jax.eval_shape(self.policy.init, jax.random.key(0))
+        params = flat_params(self.policy, example, under("params/", own))
         moments = None
         if config.normalize_observations:
             size = artifact.spaces.observation_shape
@@ -63,15 +65,50 @@ class TrainedPolicy(FrozenPolicy):
                 }
             )
         self.load(params, moments)
+        self._calls = 0  # of `predict`
 
-    def predict(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, None]:
+        """The same with the arguments, the default and the answer of Stable-Baselines3's `predict`.
+
+        Sampled actions follow from how many calls there were before.
+
+        Args:
+          state, episode_start: of recurrent policies, which there are none of; not read.
+
+        Returns:
+          `(action, None)`.
+
+        Raises:
+          BadInput: as a call of the policy.
+        """
+        key = jax.random.fold_in(jax.random.key(0), self._calls)
+        self._calls += 1
+        return self(observation, deterministic=deterministic, key=key), None
+
+    def heads(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V and the Vex head, `[L]` each, at what the network got `[L, *obs]`."""
-        found = []
-        for first in range(0, len(seen), CHUNK):
-            part = seen[first : first + CHUNK]
-            padded = np.zeros((CHUNK, *part.shape[1:]), part.dtype)
-            padded[: len(part)] = part
-            heads = self._predict(self._params, padded)
-            found.append([np.asarray(head)[: len(part)] for head in heads])
-        value, vex = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        value, vex = _in_chunks(partial(self._predict, self.params), seen)
         return value, vex
+
+    def log_prob(self, seen: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """Log-probabilities `[L]` of what the network chose `[L, A]` at what it got `[L, *obs]`."""
+        (found,) = _in_chunks(lambda *rows: (self._log_prob(self.params, *rows),), seen, action)
+        return found
+
+
+def _in_chunks(function: Callable[..., tuple[Any, ...]], *rows: np.ndarray) -> list[np.ndarray]:
+    """What `function` gives for rows `[L, ...]`, asked for `CHUNK` of them at a time."""
+    found = []
+    for first in range(0, len(rows[0]), CHUNK):
+        parts = [x[first : first + CHUNK] for x in rows]
+        padded = [np.zeros((CHUNK, *x.shape[1:]), x.dtype) for x in parts]
+        for place, part in zip(padded, parts, strict=True):
+            place[: len(part)] = part
+        found.append([np.asarray(x)[: len(parts[0])] for x in function(*padded)])
+    return [np.concatenate(parts) for parts in zip(*found, strict=True)]

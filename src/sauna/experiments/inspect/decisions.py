@@ -8,7 +8,7 @@ further one). Only the policy does not change, where training would update it be
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,16 @@ from sauna.algorithm.types import Array, Hypers, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 
 
+class Span(NamedTuple):
+    """The steps of `N` environments that make up one rollout of at most `S` steps each."""
+
+    first: np.ndarray  # [N] the step at which it begins
+    valid: np.ndarray  # [S, N] bool, the steps that are tried
+    keep: np.ndarray  # [S, N] bool, those of them that the filter keeps
+
+
 class Decisions(NamedTuple):
-    """Of one environment's `L` env steps.
+    """Of one environment's `L` env steps, to the end of its last rollout or as far as it is there.
 
     Median and edge are NaN where there are no earlier predictions, and for other filters than
     `sauna`. An edge is infinite where a target keep rate drops whatever comes.
@@ -35,6 +43,7 @@ class Decisions(NamedTuple):
     edge: np.ndarray  # [L] below which |x| is dropped
     keep: np.ndarray  # [L] bool
     rollouts: list[int]  # the steps at which a rollout begins
+    spans: list[Span]  # the rollouts, of all environments that were looked at
 
 
 def environments(config: Config) -> int:
@@ -88,48 +97,62 @@ def trace(
     return jax.lax.scan(step, state, rows)[1]
 
 
-def decide(config: Config, scored: ScoredStep, key: Any, hypers: Hypers) -> Decisions:
+def decide(
+    config: Config, scored: ScoredStep, key: Any, hypers: Hypers, steps: int | None = None
+) -> Decisions:
     """Decides rollout after rollout; what is kept is environment 0's.
 
     Args:
       config: the member's own.
-      scored: fields `[L, N, ...]`.
+      scored: fields `[at least L, N, ...]`.
       key: rollout r draws from `fold_in(key, r)`.
+      steps: that the rollouts have to cover; default all.
     """
     vex: Any = scored.vex
-    filter, steps, most = make_filter(config), len(vex), capacity(config)
+    there, number = vex.shape
+    steps, most = steps or there, capacity(config)
+    filter, longest = make_filter(config), min(most, there)
     joint = config.filter == "sauna" and config.decision == "joint"
     prediction = vex.mean(1) if joint else vex[:, 0]
-    if filter is None:
-        nothing = np.full(steps, np.nan)
-        return Decisions(
-            prediction, nothing, nothing, np.ones(steps, bool), list(range(0, steps, most))
-        )
-    before, keep = np.zeros((2, steps)), np.zeros(steps, bool)
-    rollouts: list[int] = []
-    start = 0
-    longest = min(most, steps)
-    while start < steps:
-        rows = ScoredStep(*(_stretch(x, start, longest) for x in scored))
-        rollout_key = jax.random.fold_in(key, len(rollouts))
-        first = filter.init(vex.shape[1], most)
-        mask, standard = trace(config, filter, first, rows, rollout_key, hypers)
-        own = np.asarray(mask)[:, 0]
-        full = np.flatnonzero(np.cumsum(own) == config.rollout_steps)
-        tried = min(int(full[0]) + 1 if len(full) else longest, steps - start)
-        keep[start : start + tried] = own[:tried]
-        for own_row, values in zip(before, standard, strict=True):
-            own_row[start : start + tried] = np.asarray(values)[:tried, 0]
-        rollouts.append(start)
-        start += tried
-    medians, edges = before
-    return Decisions(prediction, medians, edges, keep, rollouts)
+    before, kept = np.full((2, there), np.nan), np.zeros(there, bool)
+    first, spans = np.zeros(number, int), list[Span]()
+    while first[0] < steps:
+        rows = first + np.arange(longest)[:, None]
+        valid, keep = rows < there, rows < there
+        if filter is not None:
+            part = ScoredStep(*(rows_of(x, rows) for x in scored))
+            rollout_key = jax.random.fold_in(key, len(spans))
+            state = filter.init(number, most)
+            mask, standard = trace(config, filter, state, part, rollout_key, hypers)
+            keep = valid & np.asarray(mask)
+            valid &= np.cumsum(keep, 0) - keep < config.rollout_steps  # until T are kept
+            keep &= valid
+            own = rows[valid[:, 0], 0]
+            before[:, own] = [np.asarray(x)[valid[:, 0], 0] for x in standard]
+        kept[rows[keep[:, 0], 0]] = True
+        spans.append(Span(first.copy(), valid, keep))
+        first += valid.sum(0)
+    rollouts = [int(span.first[0]) for span in spans]
+    median, edge = before
+    every = Decisions(prediction, median, edge, kept, rollouts, spans)
+    return until(every, int(first[0]))
 
 
-def _stretch(x: np.ndarray, start: int, length: int) -> np.ndarray:
-    """`x[start : start + length]`, filled up with zeros: one compiled shape for all rollouts."""
-    part = x[start : start + length]
-    return np.concatenate([part, np.zeros((length - len(part), *x.shape[1:]), x.dtype)])
+Columns = TypeVar("Columns", bound=NamedTuple)
+
+
+def until(columns: Columns, steps: int) -> Columns:
+    """The arrays of a record cut to their first steps; its other fields stay."""
+    arrays = {n: x for n, x in columns._asdict().items() if isinstance(x, np.ndarray)}
+    cut: Any = {name: array[:steps] for name, array in arrays.items()}
+    return columns._replace(**cut)
+
+
+def rows_of(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Row `rows[s, n]` of environment n of `[L, N, ...]`: `[S, N, ...]`; zeros behind the end."""
+    found = x[np.minimum(rows, len(x) - 1), np.arange(x.shape[1])]
+    found[rows >= len(x)] = 0
+    return found
 
 
 def advantages(config: Config, stream: Rollout, rollouts: list[int], hypers: Hypers) -> np.ndarray:

@@ -11,22 +11,22 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sauna.algorithm.policy.normalize import Moments, scale_rewards
-from sauna.algorithm.types import Hypers, Rollout, ScoredStep, member_keys
+from sauna.algorithm.learner.program import make_learner
+from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
-from sauna.envs.host.answers import close
-from sauna.envs.make import make_env
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frames_per_second
-from sauna.experiments.inspect.decisions import Decisions, advantages, decide, environments
-from sauna.experiments.inspect.recording import Played, open_env, play_episodes, play_steps
+from sauna.experiments.inspect.decisions import Decisions, advantages, decide, until
+from sauna.experiments.inspect.learned import Learned, learned, reads_rollouts
+from sauna.experiments.inspect.recording import Played, open_env, play_episodes
+from sauna.experiments.inspect.streams import more_plays, scaled, stacked, stream_of
 from sauna.system import run_directory
 from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.artifact import Artifact
 from sauna.training.loop.budget import hypers_now
-from sauna.training.loop.member_state import Counters, under
+from sauna.training.loop.member_state import Counters, under, unpack_optimizer, unpack_sampler
 
 LARGEST = 10_000_000  # numbers in the matrix whose principal components are computed
 
@@ -42,15 +42,21 @@ class Inspection(NamedTuple):
     played: Played
     steps_per_second: float  # of the environment's own clock
     decisions: Decisions
+    learned: Learned | None  # what the learner's rules take; None: they take no subset
     environments: int  # that each decision looked at
     head: bool  # whether a Vex head was trained
     hypers: Hypers
-    trained_keep_rate: float | None  # of the last iteration before the checkpoint
+    last: dict[str, Any]  # the metrics of the last iteration before the checkpoint, if it is there
     reward: np.ndarray  # in the units of `value`
     value: np.ndarray
     advantage: np.ndarray  # NaN where the run computes none
     points: np.ndarray | None  # [L, 2] principal components of the observations
     shares: list[float]  # of their variance, along both
+
+    @property
+    def taken(self) -> np.ndarray:
+        """Whether each step is learned from `[L]`, as far as filter and sampler decide that."""
+        return self.decisions.keep if self.learned is None else self.learned.taken
 
 
 def examine(
@@ -71,35 +77,26 @@ def examine(
     if member is None:
         raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
     config, iteration = member.config, int(manifest["iteration"])
-    kwargs = json.loads(config.env_kwargs)
-    env, drawer = open_env(config.env, kwargs, frames, say)
+    env, drawer = open_env(config.env, json.loads(config.env_kwargs), frames, say)
     policy = TrainedPolicy(artifact, name, env)
     played = play_episodes(policy, env, episodes, deterministic, seed, drawer, max_steps, say)
-    steps_per_second = frames_per_second(env)
-    close(env)
+    steps, steps_per_second = len(played.reward), frames_per_second(env)
     own = under(name + "/", artifact.checkpoint.arrays)
-    rows = [
-        row
-        for row in run_directory.rows(run)
-        if row["member"] == name and row["iteration"] < iteration
-    ]
-    trained_keep_rate = rows[-1]["keep_rate"] if rows else None
-    hypers = hypers_of(config, own, trained_keep_rate)
-    steps, number = len(played.reward), environments(config)
-    seen = [played.observation]
-    for n in range(1, number):
-        env = make_env(config.env, kwargs)
-        seen.append(play_steps(policy, env, steps, deterministic, seed, n))
-        close(env)
-    value, own_vex = policy.predict(played.observation)
-    vex = np.stack([own_vex, *(policy.predict(x)[1] for x in seen[1:])], 1)
+    plays = more_plays(config, policy, env, played, deterministic, seed, max_steps, say)
+    streams = stacked([stream_of(policy, config, own, one) for one in plays])
+    last = last_row(run, name, iteration)
+    hypers = hypers_of(config, own, last.get("keep_rate"))
     key = jax.random.fold_in(member_keys(member.seed).filter, iteration)
-    none: Any = np.zeros(vex.shape, np.float32)
-    observed: Any = np.stack(seen, 1)
-    scored = ScoredStep(observed, none[..., None], none, none, vex)
-    decisions = decide(config, scored, key, hypers)
-    reward = scaled(config, own, played.reward)
-    stream = _stream(policy, played, reward, value, decisions.keep)
+    scored = ScoredStep(*(getattr(streams, field) for field in ScoredStep._fields))
+    decisions = decide(config, scored, key, hypers, steps)
+    found = None
+    if reads_rollouts(config):
+        state = member_state(config, policy, artifact, own)
+        parts = config, policy.policy, artifact.spaces, state, streams, decisions.spans
+        found = until(learned(*parts, hypers, member.seed, iteration), steps)
+    end = len(decisions.keep)
+    kept: Any = decisions.keep[:, None]
+    alone = Rollout(*(x[:end, :1] for x in streams))._replace(keep=kept)
     points, shares = principal_components(played.observation)
     return Inspection(
         member=member,
@@ -109,17 +106,33 @@ def examine(
         seed=seed,
         played=played,
         steps_per_second=steps_per_second,
-        decisions=decisions,
-        environments=number,
+        decisions=until(decisions, steps),
+        learned=found,
+        environments=len(plays),
         head=config.vex_coef > 0,
         hypers=hypers,
-        trained_keep_rate=trained_keep_rate,
-        reward=reward,
-        value=value,
-        advantage=advantages(config, stream, decisions.rollouts, hypers),
+        last=last,
+        reward=scaled(config, own, played.reward),
+        value=np.asarray(streams.value)[:steps, 0],
+        advantage=advantages(config, alone, decisions.rollouts, hypers)[:steps],
         points=points,
         shares=shares,
     )
+
+
+def last_row(run: Path, name: str, iteration: int) -> dict[str, Any]:
+    """The metrics of a member's last iteration before a checkpoint; empty if there are none."""
+    rows = run_directory.rows(run)
+    own = [row for row in rows if row["member"] == name and row["iteration"] < iteration]
+    return own[-1] if own else {}
+
+
+def member_state(
+    config: Config, policy: TrainedPolicy, artifact: Artifact, own: Mapping[str, np.ndarray]
+) -> TrainState:
+    """A member's learning state as its checkpoint has it."""
+    example = make_learner(config, policy.policy, artifact.spaces).init(jax.random.key(0))
+    return TrainState(policy.params, unpack_optimizer(own, example), unpack_sampler(own, example))
 
 
 def hypers_of(
@@ -134,40 +147,6 @@ def hypers_of(
     if config.filter == "random-drop" and not config.drop_rate and trained_keep_rate is not None:
         return hypers._replace(drop_rate=np.float32(1.0 - trained_keep_rate))  # type: ignore[arg-type]
     return hypers
-
-
-def scaled(config: Config, own: Mapping[str, np.ndarray], reward: np.ndarray) -> np.ndarray:
-    """Returns raw rewards `[L]` as the value function learns them, with the frozen reward
-    normaliser."""
-    if config.sign_rewards:
-        reward = np.sign(reward)
-    if not config.normalize_rewards:
-        return reward
-    on_host = "reward_moments/variance" in own  # the device keeps it with what it collects
-    place = "reward_moments" if on_host else "collect/reward_moments"
-    moments = Moments(*(np.float64(own[f"{place}/{part}"]) for part in Moments._fields))
-    return scale_rewards(moments, reward[:, None], config.clip_rewards)[:, 0]
-
-
-def _stream(
-    policy: TrainedPolicy, played: Played, reward: np.ndarray, value: np.ndarray, keep: np.ndarray
-) -> Rollout:
-    """The episodes as the collector would hand them on, `[L, 1]`."""
-    ends = np.flatnonzero(played.terminated | played.truncated)
-    next_value = np.append(value[1:], 0.0).astype(np.float32)
-    next_value[ends] = np.where(played.truncated[ends], policy.predict(played.final)[0], 0.0)
-    column: Any = {
-        "reward": reward.astype(np.float32),
-        "value": value,
-        "next_value": next_value,
-        "terminated": played.terminated | played.life_lost,
-        "truncated": played.truncated,
-        "valid": np.ones(len(value), bool),
-        "keep": keep,
-    }
-    nothing = np.zeros(len(value), np.float32)  # what GAE does not read
-    fields = [column.get(field, nothing)[:, None] for field in Rollout._fields]
-    return Rollout(*fields)
 
 
 def pixel_stride(observation: np.ndarray) -> int:

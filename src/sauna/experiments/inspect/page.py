@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from sauna.algorithm.rollout.collected import capacity
 from sauna.experiments.inspect.inspection import Inspection, pixel_stride
+from sauna.experiments.inspect.rules import rule_lines, rule_meaning, rule_notes, words
 from sauna.experiments.report.page import asset, render, rounded
 
 SETTINGS = (
@@ -25,6 +26,18 @@ SETTINGS = (
     "dropped",
     "vex_target",
     "vex_coef",
+    "sampler",
+    "sampler_kwargs",
+    "selection_mode",
+    "selection_losses",
+    "loss_weight",
+    "loss_weight_kwargs",
+    "objective",
+    "stop",
+    "critic",
+    "advantage_sign",
+    "normalize_over",
+    "control",
     "rollout_steps",
     "envs",
     "gae_over",
@@ -86,6 +99,8 @@ def page_data(found: Inspection) -> dict[str, Any]:
         {"name": "advantage", "title": f"Advantage{scaled}", "lines": ["advantage"]},
         {"name": "reward", "title": f"Reward{scaled}", "lines": ["reward"]},
     ]
+    by_rules, shown = rule_lines(found)
+    panels, lines = [*shown, *panels], by_rules | lines
     if shows_vex(found):
         panels.insert(0, {"name": "vex", "title": "Vex, predicted", "lines": ["vex"]})
         vex = {"vex": ("Vex", decisions.prediction.astype(float))}
@@ -101,7 +116,8 @@ def page_data(found: Inspection) -> dict[str, Any]:
         "starts": [0, *(ends[:-1] + 1).tolist()],
         "returns": rounded(played.returns),
         "rollouts": decisions.rollouts,
-        "keep": decisions.keep.astype(int).tolist(),
+        "keep": found.taken.astype(int).tolist(),
+        "words": words(found),
         "labels": {name: label for name, (label, _) in lines.items()},
         "series": {name: rounded(values.tolist()) for name, (_, values) in lines.items()},
         "panels": panels,
@@ -118,13 +134,13 @@ def scope(found: Inspection) -> str:
     played, episodes = found.played, len(found.played.returns)
     returns = ", ".join(f"{value:,.1f}" for value in played.returns[:5])
     more = ", ..." if episodes > 5 else ""
-    dropped = int((~found.decisions.keep).sum())
+    dropped = f"{int((~found.taken).sum()):,} {words(found)[1]}"
     return " \N{MIDDLE DOT} ".join(
         [
             f"{found.mode} actions",
             f"trained for {found.env_steps:,} env steps",
             f"{episodes} episode{'s' * (episodes > 1)}, return {returns}{more}",
-            f"{len(played.reward):,} env steps, {dropped:,} dropped",
+            f"{len(played.reward):,} env steps, {dropped}",
         ]
     )
 
@@ -134,7 +150,8 @@ def notes(found: Inspection) -> list[str]:
     config, arm, kept = found.member.config, found.member.arm, float(found.decisions.keep.mean())
     said = []
     if not shows_vex(found):
-        said.append(f"There is no Vex prediction: {arm} trains no Vex head, and keeps every step.")
+        keeps = ", and keeps every step" * (config.filter == "none" and found.learned is None)
+        said.append(f"There is no Vex prediction: {arm} trains no Vex head{keeps}.")
     elif not found.head:
         said.append(
             "The Vex head was not trained (vex_coef 0): its predictions are those of its "
@@ -143,11 +160,9 @@ def notes(found: Inspection) -> list[str]:
     if found.decisions.keep.all() and shows_vex(found):
         rule = "no step falls below the threshold" if compares(found) else f"{arm} keeps all"
         said.append(f"Nothing is dropped: {rule}.")
-    elif not found.decisions.keep.all() and found.trained_keep_rate is not None:
-        said.append(
-            f"Keep rate here {kept:.3f}; in the last iteration of training "
-            f"{found.trained_keep_rate:.3f}."
-        )
+    elif not found.decisions.keep.all() and "keep_rate" in found.last:
+        trained = found.last["keep_rate"]
+        said.append(f"Keep rate here {kept:.3f}; in the last iteration of training {trained:.3f}.")
     if config.filter not in ("none", "sauna", "random-drop"):
         said.append(
             f"The filter is {config.filter}: what it drops is shaded, its rule is not drawn."
@@ -159,10 +174,11 @@ def notes(found: Inspection) -> list[str]:
         )
     if config.control != "none" and config.filter != "none":
         said.append(
-            f"What the rule keeps is shown. Training took as many other steps, by the control "
-            f"{config.control}."
+            f"The control {config.control} chooses: of each environment and rollout as many steps "
+            f"as the filter {config.filter} keeps there."
         )
-    if found.environments > 1:
+    said += rule_notes(found)
+    if found.environments > 1 and found.learned is None:
         said.append(
             f"Decisions look at {found.environments} environments together; environment 0 is shown."
         )
@@ -190,7 +206,7 @@ def _thinned(found: Inspection) -> str:
 def meaning(found: Inspection) -> list[Markup]:
     """Returns what the lines are, and their units; no value comes from a run but numbers."""
     config = found.member.config
-    said = []
+    said = rule_meaning(found)
     if shows_vex(found):
         several = config.filter == "sauna" and config.decision == "joint" and config.envs > 1
         said.append(

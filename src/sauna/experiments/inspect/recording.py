@@ -25,14 +25,17 @@ PER_SECOND = 20  # of the environment's clock: more would not be seen
 
 
 class Played(NamedTuple):
-    """`L` env steps of whole episodes, one after the other."""
+    """`L` env steps, episode after episode; the last one may have been left before its end."""
 
     observation: np.ndarray  # [L, *obs] what the network got
+    action: np.ndarray  # [L, A] what the network chose, neither clipped nor stretched
     reward: np.ndarray  # [L] float64, raw
     terminated: np.ndarray  # [L] bool
     truncated: np.ndarray  # [L] bool, never together with terminated
     life_lost: np.ndarray  # [L] bool, an end for learning alone
-    final: np.ndarray  # [E, *obs] what the network would have got where episode e ended
+    final: (
+        np.ndarray
+    )  # [E, *obs] what the network would have got where episode e ended, or was left
     returns: list[float]  # [E] of raw rewards
     frames: list[tuple[int, bytes]]  # env step, WebP of the state before it
 
@@ -78,7 +81,7 @@ def _encoded(drawn: Any) -> bytes:
 
 
 class Recorder:
-    """An environment that notes what it is asked and what it answers.
+    """An environment that notes what it is asked and what it answers, and whom it asks.
 
     It truncates an episode of `max_steps` env steps that has not ended.
     """
@@ -90,12 +93,24 @@ class Recorder:
         frames: Frames | None,
         max_steps: int = MAX_STEPS,
     ) -> None:
-        self._env, self._see, self._frames = env, policy.see, frames
+        self._env, self._policy, self._frames = env, policy, frames
+        self._see = policy.see
         self._max_steps, self._steps = max_steps, 0
         self._now: Any = None
         self.observation: list[np.ndarray] = []
+        self.action: list[np.ndarray] = []
         self.final: list[np.ndarray] = []
         self.transitions: list[tuple[float, bool, bool, bool]] = []
+
+    def act(self, observation: Any, *, deterministic: bool, key: Any) -> Any:
+        """The policy's action for one raw observation, as the environment wants it."""
+        self.action.append(self._policy.act(observation, deterministic=deterministic, key=key))
+        return self._policy.write(self.action[-1])
+
+    def leave(self) -> None:
+        """Notes where an episode was left that has not ended."""
+        if self.transitions and not (self.transitions[-1][1] or self.transitions[-1][2]):
+            self.final.append(self._now)
 
     def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
         observation, info = self._env.reset(seed=seed)
@@ -152,27 +167,40 @@ def play_episodes(
     recorder = Recorder(env, policy, frames, max_steps)
     progress, returns = Progress(policy.name, episodes, say), []
     for i in range(episodes):
-        episode = play(policy, recorder, deterministic, seed + i, progress.step, max_steps)
+        episode = play(recorder.act, recorder, deterministic, seed + i, progress.step, max_steps)
         returns.append(progress.played(episode).return_)
     progress.say_cut(max_steps)
     return _played(recorder, returns, frames)
 
 
 def play_steps(
-    policy: TrainedPolicy, env: Any, steps: int, deterministic: bool, seed: int, number: int
-) -> np.ndarray:
-    """Returns what the network gets in `steps` env steps of environment `number`, `[L, *obs]`."""
-    recorder, episode = Recorder(env, policy, None, steps), 0
-    while len(recorder.transitions) < steps:
-        play(
-            policy,
-            recorder,
-            deterministic,
-            episode_seed(seed, number, episode),
-            max_steps=steps,
-        )
+    policy: TrainedPolicy,
+    env: Any,
+    steps: int,
+    deterministic: bool,
+    seed: int,
+    number: int,
+    first: int = 0,
+    max_steps: int = MAX_STEPS,
+) -> Played:
+    """Returns `steps` env steps of environment `number`, from its episode `first` on."""
+    recorder, episode = Recorder(env, policy, None, max_steps), first
+    while (left := steps - len(recorder.transitions)) > 0:
+        own_seed = episode_seed(seed, number, episode)
+        play(recorder.act, recorder, deterministic, own_seed, max_steps=min(left, max_steps))
         episode += 1
-    return np.stack(recorder.observation[:steps])
+    recorder.leave()
+    return _played(recorder, [], None)
+
+
+def joined(first: Played, second: Played) -> Played:
+    """One play behind another; returns and frames are the first's."""
+    both: Any = {
+        name: np.concatenate([array, getattr(second, name)])
+        for name, array in first._asdict().items()
+        if isinstance(array, np.ndarray)
+    }
+    return first._replace(**both)
 
 
 def _played(recorder: Recorder, returns: list[float], frames: Frames | None) -> Played:
@@ -180,6 +208,7 @@ def _played(recorder: Recorder, returns: list[float], frames: Frames | None) -> 
     reward, terminated, truncated, life_lost = columns
     return Played(
         np.stack(recorder.observation),
+        np.stack(recorder.action),
         reward,
         terminated,
         truncated,

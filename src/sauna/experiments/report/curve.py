@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -54,23 +56,34 @@ def draw_curve(run: Path) -> Path | None:
     What keeps it from being drawn costs nothing else: the training has ended well.
     """
     try:
-        return _draw_run(run)
+        figure = curve_figure(run)
+        return figure and _saved(figure, run / "figures" / "learning_curve.png")
     except Exception as error:  # of a disk that is full, or of Matplotlib
         print(f"warning: no learning curve was drawn: {one_line(error)}", file=sys.stderr)
         return None
 
 
-def _draw_run(run: Path) -> Path | None:
-    """Draws the curve of a run; None if no episode has finished."""
+def curve_figure(run: Path) -> Any:
+    """The learning curves of a run as a matplotlib figure; None if no episode has finished.
+
+    A notebook shows it, as the figure says what it looks like (`_repr_png_`).
+    """
     rows = run_directory.rows(run)
     curves, evaluations = member_curves(rows), member_curves(rows, "eval_return_mean")
     if not curves:
         return None
     config = run_directory.read_config(run, needed=("config",))["config"]
     title = f"{config['env']}, preset {config['preset']}"
-    path = run / "figures" / "learning_curve.png"
     y_label = EVALUATED if evaluations else TRAINING_RETURN
-    return _draw(curves, {arm: arm for arm in curves}, title, y_label, path, evaluations)
+    figure = _figure(curves, {arm: arm for arm in curves}, title, y_label, evaluations)
+    figure._repr_png_ = partial(_png, figure)
+    return figure
+
+
+def _png(figure: Any) -> bytes:
+    with style.applied(), io.BytesIO() as file:
+        figure.savefig(file, format="png")
+        return file.getvalue()
 
 
 def plot(paths: Sequence[Path], out: str = "", tag: str = "") -> Path:
@@ -98,17 +111,22 @@ def draw_sources(sources: list[Source], path: Path) -> Path:
     tasks = list(dict.fromkeys(source.task for source in sources if source.task))
     known = all(source.arm for source in sources)
     arms = {source.label: source.arm or source.label for source in sources}
-    return _draw(curves, arms, ", ".join(tasks), TRAINING_RETURN if known else "return", path)
+    y_label = TRAINING_RETURN if known else "return"
+    return _saved(_figure(curves, arms, ", ".join(tasks), y_label), path)
 
 
-def _draw(
+def _saved(figure: Any, path: Path) -> Path:
+    with style.applied():
+        return style.save(figure, path)
+
+
+def _figure(
     curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
     arms: Mapping[str, str],
     title: str,
     y_label: str,
-    path: Path,
     evaluations: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]] = MappingProxyType({}),
-) -> Path:
+) -> Any:
     from matplotlib.figure import Figure
 
     looks = style.looks(arms)
@@ -126,7 +144,7 @@ def _draw(
         axes.set_title(title)
         axes.legend()
         style.count_steps(axes)
-        return style.save(figure, path)
+    return figure
 
 
 def _draw_arm(

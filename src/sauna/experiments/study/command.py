@@ -19,7 +19,7 @@ from sauna.config.presets import (
     algorithm_of,
     chosen_preset,
 )
-from sauna.config.trust import check_trusted, covers, seal
+from sauna.config.trust import check_trusted, covers, named_code, seal
 from sauna.envs.probe import Probe
 from sauna.experiments.sequential import DESIGN
 from sauna.experiments.study.execute.display import StudyView
@@ -120,9 +120,14 @@ def compare_command(
     return f"sauna compare {shlex.quote(env)} {chosen}{flags}{_typed_out(out)}"
 
 
-def study_command(name: str, out: str | Path, names_code: bool = False) -> str:
-    """Returns what a user types to run the study again; another one has to trust its code."""
-    return f"sauna study {shlex.quote(name)}{_typed_out(out)}" + " --trust" * names_code
+def study_command(name: str, out: str | Path, text: Mapping[str, Any] | None = None) -> str:
+    """Returns what a user types to run the study again; another one has to trust code it names.
+
+    Args:
+      text: what the study was read from.
+    """
+    trust = " --trust" if named_code(text or {}) else ""
+    return f"sauna study {shlex.quote(name)}{_typed_out(out)}{trust}"
 
 
 def _typed_out(out: str | Path) -> str:

@@ -35,10 +35,10 @@ from typing import Any, NamedTuple
 
 from sauna.config.checks import is_read
 from sauna.config.presets import (
-    FIXED,
     RunConfig,
     arm_config,
     arm_settings,
+    fixed_by,
     parse_all,
     resolve_run,
 )
@@ -199,7 +199,7 @@ def _read_arm(entry: dict[str, Any], top: Mapping[str, Any], common: dict[str, A
 def reads(arm: str, settings: Mapping[str, Any], key: str) -> bool:
     """Returns whether a run of `arm` with these settings takes the setting `key` at all."""
     config = arm_config(arm, parse_all(settings))
-    return is_read(key, config) and key not in FIXED.get(arm, ())
+    return is_read(key, config) and key not in fixed_by(arm)
 
 
 def _check_common(common: Mapping[str, Any], arms: list[Arm]) -> None:

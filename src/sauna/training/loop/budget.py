@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,6 +10,7 @@ from sauna.algorithm.types import Array, Hypers
 from sauna.config.settings import Config
 from sauna.training.loop.job import Setting
 from sauna.training.loop.member_state import Counters
+from sauna.training.loop.schedules import scheduled
 
 
 def budget_left(config: Config, counters: Counters) -> bool:
@@ -37,45 +36,14 @@ def step_limit(config: Config, counters: Counters) -> int:
 def hypers_now(member_config: Config, counters: Counters) -> Hypers:
     """Computes the traced hyperparameters of a member, of whose budget `counters` are used."""
     used = counters.kept_steps if member_config.budget == "kept" else counters.env_steps
-    left = share_left(member_config, used)
     values = {name: getattr(member_config, name) for name in Hypers._fields}
-    values["threshold"] = scheduled(member_config.threshold, member_config.threshold_schedule, left)
-    if member_config.learning_rate_schedule == "linear":
-        values["learning_rate"] = member_config.learning_rate * left
+    coming = member_config.rollout_steps * member_config.envs
+    values |= scheduled(member_config, values, used, member_config.steps, coming)
     return Hypers(**{name: np.float32(value) for name, value in values.items()})  # type: ignore[arg-type]
-
-
-def share_left(config: Config, used: int) -> float:
-    """Computes the share of the schedules that is left when `used` steps of the budget are used.
-
-    It is 1 up to `schedule_start` and falls to 0 at the end of the budget.
-    """
-    if not config.schedule_start:
-        return 1.0 - used / config.steps
-    first = config.schedule_start
-    return min(1.0, 1.0 - (used - first) / (config.steps - first))
-
-
-def scheduled(threshold: Any, schedule: str, left: Any) -> Any:
-    """Schedules the threshold, when the share `left` of the budget is left."""
-    return {"constant": threshold, "rising": threshold * (1.0 - left), "falling": threshold * left}[
-        schedule
-    ]
 
 
 def device_hypers(config: Config, setting: Setting, used: Array) -> Hypers:
     """Computes a member's hyperparameters from `setting`, when `used` steps of its budget are."""
-    left, rate = _device_share_left(config, setting, used), setting.hypers.learning_rate
-    return setting.hypers._replace(
-        learning_rate=rate * left if config.learning_rate_schedule == "linear" else rate,
-        threshold=scheduled(setting.hypers.threshold, config.threshold_schedule, left),
-    )
-
-
-def _device_share_left(config: Config, setting: Setting, used: Array) -> Array:
-    """The device's twin of `share_left`."""
-    if not config.schedule_start:
-        return 1.0 - used.astype(jnp.float32) / setting.steps
-    first = config.schedule_start
-    after = (used - first).astype(jnp.float32) / (setting.steps - first)
-    return jnp.minimum(1.0, 1.0 - after)
+    first, coming = setting.hypers._asdict(), config.rollout_steps * config.envs
+    moved = scheduled(config, first, used.astype(jnp.float32), setting.steps, coming)
+    return setting.hypers._replace(**moved)

@@ -21,7 +21,7 @@ from sauna.algorithm.policy.normalize import LongMoments, Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import Collected, Episode
 from sauna.algorithm.rollout.device import LARGEST
-from sauna.algorithm.types import Hypers, TrainState, member_keys
+from sauna.algorithm.types import Hypers, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config, fields_with, to_json
 from sauna.envs.device.contract import flat
@@ -48,13 +48,9 @@ from sauna.training.loop.job import Job, Reporter, Setting, check_finite
 from sauna.training.loop.member_state import (
     Counters,
     fitting,
-    flat_params,
-    named_optimizer,
-    named_params,
-    named_sampler,
+    named_learner,
     under,
-    unpack_optimizer,
-    unpack_sampler,
+    unpack_learner,
 )
 from sauna.training.loop.metrics import metrics_row
 from sauna.training.loop.multihost import (
@@ -197,7 +193,8 @@ def _report(
             before = counters[p].env_steps
             counters[p].add(collected)
             steps += collected.env_steps
-            row = _row(member, job.config, first + i, collected, counters[p], report)
+            now = report.learned, report.hypers
+            row = metrics_row(member, job.config, first + i, collected, counters[p], *now)
             frozen = partial(_frozen, population, p)
             rows.append(row | evaluator.after(p, counters[p], before, frozen))
         timing = {"env_steps": steps, "seconds": seconds / number}
@@ -243,19 +240,6 @@ def _collected(report: Report) -> Collected:
     )
 
 
-def _row(
-    member: Member,
-    config: Config,
-    iteration: int,
-    collected: Collected,
-    counters: Counters,
-    report: Report,
-) -> dict[str, Any]:
-    values = {name: getattr(member.config, name) for name in Hypers._fields}
-    hypers = Hypers(**{**values, "learning_rate": report.learning_rate})
-    return metrics_row(member, config, iteration, collected, counters, report.learned, hypers)
-
-
 def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
     """The whole state of all members, as named arrays."""
     arrays: Arrays = {}
@@ -267,9 +251,7 @@ def pack(job: Job, population: Population, counters: list[Counters]) -> Arrays:
 
 def _pack_member(policy: Policy, state: MemberState, counters: Counters) -> Arrays:
     learner = state.learner
-    arrays = {f"params/{name}": a for name, a in named_params(policy, learner.params).items()}
-    arrays |= named_optimizer(learner) | named_sampler(learner)
-    arrays |= counters.to_arrays()
+    arrays = named_learner(policy, learner) | counters.to_arrays()
     moments = _moments(state)
     if moments is not None:  # where a trained policy looks for them, as the host's
         arrays |= {f"observation_moments/{name}": a for name, a in moments._asdict().items()}
@@ -346,11 +328,9 @@ def _restore(job: Job, population: Population, arrays: Mapping[str, np.ndarray])
     for member, example in zip(job.members, population.states(), strict=True):
         own = under(member.name + "/", arrays)
         counted = Counters.from_arrays(own)
-        optimizer = unpack_optimizer(own, example.learner)
-        params = flat_params(population.policy, example.learner.params, under("params/", own))
         states.append(
             MemberState(
-                TrainState(params, optimizer, unpack_sampler(own, example.learner)),
+                unpack_learner(population.policy, own, example.learner),
                 filled(example.collect, under("collect/", own)),
                 jnp.int32(counted.env_steps),
                 jnp.int32(counted.kept_steps),

@@ -21,6 +21,7 @@ from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.metrics import UpdateMetrics
 from sauna.algorithm.learner.program import make_parts
 from sauna.algorithm.learner.samples import make_batch
+from sauna.algorithm.learner.selected import drawn_length
 from sauna.algorithm.learner.update import Parts, device_minibatch_order, init_state
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.rollout.collected import capacity
@@ -56,7 +57,7 @@ class Report(NamedTuple):
     ends: Ends
     faults: Faults
     learned: UpdateMetrics
-    learning_rate: Array
+    hypers: Hypers  # after their schedules
 
 
 class IterationParts(NamedTuple):
@@ -117,7 +118,7 @@ def iterate(
         learner, collected, state.env_steps + env_steps, state.kept_steps + kept_steps
     )
     after = jax.tree.map(lambda new, old: jnp.where(has_budget, new, old), after, state)
-    report = Report(has_budget, env_steps, kept_steps, ends, faults, learned, hypers.learning_rate)
+    report = Report(has_budget, env_steps, kept_steps, ends, faults, learned, hypers)
     return after, report
 
 
@@ -133,7 +134,8 @@ def learn_from(
     config = parts.config
     key = selection_key(setting.keys, iteration)
     batch = make_batch(rollout, hypers, key, config=config, target=parts.learning.target)
-    order = device_minibatch_order(config, jax.random.fold_in(setting.keys.order, iteration))
+    own = jax.random.fold_in(setting.keys.order, iteration)
+    order = device_minibatch_order(config, own, drawn_length(parts.learning))
     return learn(learner, rollout, batch, hypers, order, key, parts=parts.learning)
 
 

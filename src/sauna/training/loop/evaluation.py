@@ -21,7 +21,7 @@ from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import capacity
-from sauna.algorithm.rollout.play import Episode, play, play_on_device
+from sauna.algorithm.rollout.play import Episode, play, play_on_device, success_rate
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv
@@ -76,6 +76,7 @@ class Evaluated:
             "eval_return_best": self.best,
             "eval_returns": returns,
             "eval_env_steps": self.env_steps,
+            **{f"eval_{name}": rate for name, rate in success_rate(episodes).items()},
         }
 
     def stop(self, config: Config, mean: float) -> int:
@@ -253,8 +254,8 @@ class DevicePlayer:
             moments = Moments(*(np.asarray(part, np.float32) for part in moments))
         played = jax.device_get(self._episodes(np.asarray(frozen.params), moments, keys))
         return [
-            Episode(float(return_), int(length), bool(cut))
-            for return_, length, cut in zip(*played, strict=True)
+            Episode(float(return_), int(length), bool(cut), float(s) if np.isfinite(s) else None)
+            for return_, length, cut, s in zip(*played, strict=True)
         ]
 
 

@@ -122,9 +122,7 @@ def pack_member(
     envs: HostEnvs,
 ) -> dict[str, np.ndarray]:
     """Member `p`'s state, every name starting with the member's."""
-    arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
-    arrays |= named_optimizer(state) | named_sampler(state)
-    arrays |= counters.to_arrays()
+    arrays = named_learner(policy, state) | counters.to_arrays()
     for key, value in (moments_of(collector, p) | collected_of(collector, p)).items():
         arrays[key] = value
     number = collector.state.episode_length.shape[1]
@@ -134,17 +132,49 @@ def pack_member(
     return {f"{name}/{key}": np.array(value) for key, value in arrays.items()}
 
 
+def named_learner(policy: Policy, state: TrainState) -> dict[str, np.ndarray]:
+    """What learning changes, as named arrays."""
+    arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
+    arrays |= named_optimizer(state) | named_sampler(state)
+    if moves_rate_in(state):
+        arrays["learning_rate"] = np.asarray(state.learning_rate)
+    return arrays
+
+
+def unpack_learner(
+    policy: Policy, own: Mapping[str, np.ndarray], example: TrainState
+) -> TrainState:
+    """The inverse of `named_learner`.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    rate = example.learning_rate
+    if moves_rate_in(example):
+        rate = jnp.asarray(fitting(own, "learning_rate", rate))
+    params = flat_params(policy, example.params, under("params/", own))
+    return TrainState(params, unpack_optimizer(own, example), unpack_sampler(own, example), rate)
+
+
+def moves_rate_in(state: TrainState) -> bool:
+    """Returns whether a state carries a learning rate."""
+    return not isinstance(state.learning_rate, tuple)
+
+
 def named_optimizer(state: TrainState) -> dict[str, np.ndarray]:
     """The optimizer's state as arrays, in its own order."""
     optimizer = state.optimizer
     if isinstance(optimizer, optax.ScaleByRmsState):
         named = {"rmsprop/mean_square": optimizer.nu}
-    else:
+    elif isinstance(optimizer, optax.ScaleByAdamState):
         named = {
             "adam/count": optimizer.count,
             "adam/mean": optimizer.mu,
             "adam/variance": optimizer.nu,
         }
+    else:
+        leaves = jax.tree_util.tree_leaves(optimizer)
+        named = {f"optimizer/{i}": leaf for i, leaf in enumerate(leaves)}
     return {name: np.asarray(array) for name, array in named.items()}
 
 
@@ -172,12 +202,10 @@ def unpack_optimizer(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
     Raises:
       BadCheckpoint: an array is missing, or of another shape or type.
     """
-    return type(example.optimizer)(
-        *(
-            jnp.asarray(fitting(own, name, place))
-            for name, place in named_optimizer(example).items()
-        )
-    )
+    structure = jax.tree_util.tree_structure(example.optimizer)
+    named = named_optimizer(example)
+    leaves = [jnp.asarray(fitting(own, name, place)) for name, place in named.items()]
+    return jax.tree_util.tree_unflatten(structure, leaves)
 
 
 def unpack_member(
@@ -198,8 +226,7 @@ def unpack_member(
       NotRestored: a replayed environment shows another observation than the stored one.
     """
     own = under(name + "/", arrays)
-    params = flat_params(policy, example.params, under("params/", own))
-    state = TrainState(params, unpack_optimizer(own, example), unpack_sampler(own, example))
+    state = unpack_learner(policy, own, example)
     counters = Counters.from_arrays(own)
     for key, place in moments_of(collector, p).items():
         place[...] = fitting(own, key, place)

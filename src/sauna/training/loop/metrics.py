@@ -61,5 +61,8 @@ def metrics_row(
             row[name] = float(value)
     if "vex_target" in row and not float(hypers.vex_coef):
         del row["vex_loss"], row["vex_target"]  # nothing learns them in this arm
-    row["learning_rate"] = float(hypers.learning_rate)
+    row.setdefault("learning_rate", float(hypers.learning_rate))
+    for name in ("clip_range", "entropy_coef"):
+        if getattr(config, f"{name}_schedule") != "constant":
+            row[name] = float(getattr(hypers, name))
     return row

@@ -3,7 +3,7 @@
 (() => {
   const { html, svg, fixed, number, ticks, extent, stretches, joined, path } = draw;
   const data = JSON.parse(document.getElementById("data").textContent);
-  const { series, labels, keep, starts, rollouts, points, frames } = data;
+  const { series, labels, keep, words, starts, rollouts, points, frames } = data;
   const LAST = keep.length - 1;
   const WINDOW = 200; // env steps that are shown when zoomed
   const EDGE = { top: 6, right: 8, left: 48 };
@@ -65,7 +65,7 @@
     cells.get("step").textContent = `${fixed(now, 0)} of ${fixed(LAST, 0)}`;
     cells.get("episode").textContent = `${episode + 1} of ${starts.length}, step ${fixed(now - starts[episode], 0)}`;
     const decision = cells.get("decision");
-    decision.textContent = keep[now] ? "kept" : "dropped";
+    decision.textContent = words[keep[now] ? 0 : 1];
     decision.className = keep[now] ? "" : "dropped";
     for (const name of Object.keys(labels)) {
       cells.get(name).textContent = number(series[name][now], places[name]);
@@ -108,7 +108,7 @@
     const samples = panel.lines.map((name, i) => [`line ${i ? "second" : "first"}`, "M0,6H18", labels[name]]);
     const BOX = "M2,1H16V11H2Z";
     if (panel.band) samples.push(["band", BOX, "threshold band"]);
-    if (!place) samples.push(["kept-strip", BOX, "kept"], ["dropped-strip", BOX, "dropped"]);
+    if (!place) samples.push(["kept-strip", BOX, words[0]], ["dropped-strip", BOX, words[1]]);
     makeKey(box, panel.title, samples.length > 1 ? samples : []);
     const root = svg(box, "svg", { role: "img", "aria-label": panel.title });
     const isLast = place === data.panels.length - 1;
@@ -255,8 +255,8 @@
     root.addEventListener("pointermove", follow);
     root.addEventListener("pointerdown", follow);
     const count = (kept) => fixed(keep.filter((k) => Boolean(k) === kept).length, 0);
-    box.prepend(makeKey(null, "", [["kept", "M9,6h0", `kept: ${count(true)}`],
-                                   ["dropped", "M6,3l6,6m0,-6l-6,6", `dropped: ${count(false)}`]]));
+    box.prepend(makeKey(null, "", [["kept", "M9,6h0", `${words[0]}: ${count(true)}`],
+                                   ["dropped", "M6,3l6,6m0,-6l-6,6", `${words[1]}: ${count(false)}`]]));
     listeners.push(() => { if (here) showHere(); });
     drawStates();
     new ResizeObserver(() => { if (box.clientWidth !== width) drawStates(); }).observe(box);

@@ -1,0 +1,20 @@
+"""What the settings that name a part may be called."""
+
+from __future__ import annotations
+
+FILTERS = ("none", "sauna", "random-drop")
+SAMPLERS = (
+    "none",
+    "gigaflow",
+    "top-advantage",
+    "prioritized",
+    "gradient-norm",
+    "kondo",
+    "positive",
+    "pods",
+    "vex-oracle",
+)
+VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
+NETWORKS = ("auto", "mlp", "nature-cnn")
+OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
+SCHEDULES = ("constant", "linear", "cosine")
