@@ -16,6 +16,7 @@ FLOORS = (
     "config",
     "envs.registration",
     "envs.info",
+    "envs.shapes",
     "envs.spaces",
     "envs.device",
     "envs.flagrun",

@@ -100,4 +100,9 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_HOMES[name]), name)
 
 
+def __dir__() -> list[str]:
+    """Lists the public names too, which are not imported yet."""
+    return sorted({*globals(), *__all__})
+
+
 _register()

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.accepted import translate
+from sauna.config.flags import lists_settings
+from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.presets import COMPARED, parse_all
-from sauna.config.settings import fields_with
+from sauna.config.settings import FIELDS, fields_with
 from sauna.envs.make import check_makes, known_in_this_process_alone
 from sauna.experiments.report.curve import curve_figure, draw_curve
 from sauna.system import run_directory
@@ -21,6 +23,8 @@ from sauna.training.display import Display, PlainDisplay, make_display
 from sauna.training.pick import pick
 from sauna.training.train import train_run
 
+_OF_TRAIN = [name for name in FIELDS if name != "env"]
+_OF_COMPARE = [name for name in _OF_TRAIN if name not in (*fields_with("decided_by_study"), "arm")]
 PARTS = fields_with("plugin")  # what a user may pass by value
 
 
@@ -108,6 +112,7 @@ class _Silent(PlainDisplay):
         pass
 
 
+@lists_settings(_OF_TRAIN)
 def train(
     env: Any,
     *,
@@ -161,6 +166,7 @@ def train_and_draw(
     train_run(run, display, resume=resume, inexact=inexact, callback=callback, draw=draw_curve)
 
 
+@lists_settings(_OF_COMPARE)
 def compare(
     env: Any,
     *,
@@ -248,6 +254,7 @@ def resume(
     return Result(run.path)
 
 
+@names_the_folder
 def load(
     path: str | Path,
     member: int | str = 0,

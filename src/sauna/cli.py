@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 from sauna import __version__
 from sauna.config.accepted import translate
 from sauna.config.flags import add_fields, shown_values
-from sauna.config.other_names import flag_hint
+from sauna.config.other_names import flag_hint, spread_hint
 from sauna.config.parsing import whole_number
 from sauna.config.presets import (
     COMPARED,
@@ -224,7 +224,7 @@ def _run(arguments: list[str]) -> None:
             for action in _subparser(parser, parsed.command)._actions
             for option in action.option_strings
         ]
-        hint = flag_hint(unknown[0], flags, parsed.command)
+        hint = spread_hint(arguments, unknown[0]) or flag_hint(unknown[0], flags, parsed.command)
         raise BadInput(f"unknown argument {unknown[0]!r}{hint}")
     values = {name: value for name, value in vars(parsed).items() if name != "command"}
     if parsed.command is None:

@@ -24,6 +24,7 @@ def test_every_field_has_a_group_and_ten_or_so_come_first() -> None:
 
 @pytest.mark.parametrize("name", [n for n, f in FIELDS.items() if f.metadata["read_when"]])
 def test_a_field_that_nothing_reads_is_refused_with_what_would_read_it(name: str) -> None:
+    kl = name in ("desired_kl", "learning_rate_min", "learning_rate_max")
     unread = dataclasses.replace(
         Config(),
         algorithm="a2c" if name not in ("rmsprop_epsilon", "rmsprop_decay") else "ppo",
@@ -36,6 +37,7 @@ def test_a_field_that_nothing_reads_is_refused_with_what_would_read_it(name: str
         normalize_rewards=False,
         normalize_advantages=False,
         advantage_sign="positive" if name == "normalize_advantages" else "both",
+        learning_rate_schedule="constant" if kl else "kl",
     )
     needed = FIELDS[name].metadata["read_when"][0]
     assert not is_read(name, unread)

@@ -120,6 +120,7 @@ def check_command(command: list[str]) -> None:
         "pip": check_pip,
         "make": check_make,
         "python": check_script,
+        "source": check_source,
         "apt-get": lambda arguments: None,
     }
     assert command[0] in known, command
@@ -158,6 +159,11 @@ def check_pip(arguments: list[str]) -> None:
 def check_make(arguments: list[str]) -> None:
     for target in arguments:
         assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target
+
+
+def check_source(arguments: list[str]) -> None:
+    assert arguments == [".venv/bin/activate"]  # which `make setup` and `make demo` make
+    assert re.search(r"^VENV .*= \.venv$", (ROOT / "Makefile").read_text(), re.MULTILINE)
 
 
 def check_script(arguments: list[str]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import worlds
-from sauna.envs.host.answers import close, life_lost, one_number, reset_with
+from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_number, reset_with
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.probe import probe
@@ -27,8 +27,18 @@ def test_one_number_in_any_form_is_that_number(reward: Any) -> None:
 
 @pytest.mark.parametrize("reward", [None, np.zeros(2), [], {}, 2j])
 def test_a_reward_that_is_not_one_number_is_refused(reward: Any) -> None:
-    with pytest.raises(ValueError, match=r"the reward is .*, not one number"):
+    with pytest.raises(ValueError, match=r"the reward from step\(\) is .*, not one number"):
         one_number(reward)
+
+
+def test_step_and_reset_that_return_too_little_name_the_contract() -> None:
+    five = (0.0, 1.0, False, False, {})
+    assert five_of(five) == five and first_of((0.5, {})) == 0.5
+    with pytest.raises(ValueError, match=r"step\(\) must return obs.*, info; it returned 4 values"):
+        five_of(five[:4])
+    for answer, words in ((np.zeros(2), "one ndarray"), (None, "nothing"), (([],), "1 value")):
+        with pytest.raises(ValueError, match=rf"reset\(\) must .*, info; it returned {words}$"):
+            first_of(answer)
 
 
 def test_info_says_that_a_life_was_lost_or_nothing() -> None:

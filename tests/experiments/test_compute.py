@@ -11,6 +11,7 @@ from sauna.experiments.compute import (
     compute_ratio,
     cumulated,
     drawn,
+    has_risen,
     joined,
     learner_seconds,
     reached,
@@ -77,6 +78,15 @@ def test_the_baseline_itself_needs_its_own_compute_even_if_it_levels_off() -> No
     """Negative control: a ratio to all of the baseline's compute would be 0.2 here."""
     base = curves([0.0, 20.0, 100.0], [0.0, 10.0, 10.0], [0.0, 30.0, 30.0])
     assert compute_ratio(base, base).value == pytest.approx(1.0)
+
+
+def test_a_baseline_rises_if_all_seeds_do_and_not_by_noise() -> None:
+    """Rises of 8 and 10: mean 9, half of the 95% interval 12.7; with a third of 9 it is 2.5."""
+    x = [0.0, 50.0, 100.0]
+    assert not has_risen(curves(x, [None, 2.0, 10.0], [2.0, 1.0, 12.0]))
+    assert has_risen(curves(x, [None, 2.0, 10.0], [2.0, 1.0, 12.0], [0.0, 0.0, 9.0]))
+    assert not has_risen(curves(x, [0.0, 9.0, 9.0]))  # one seed
+    assert not has_risen(curves(x, [9.0, 9.0, 0.0], [8.0, 8.0, 0.0], [9.0, 9.0, 1.0]))  # it fell
 
 
 def test_an_arm_that_does_not_get_there() -> None:

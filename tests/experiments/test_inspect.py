@@ -188,7 +188,7 @@ def test_the_units_of_signs_are_signs(run, found) -> None:
 def test_a_run_is_decided_by_its_own_head_and_settings(run, found) -> None:
     config = found.member.config
     policy = TrainedPolicy(load_artifact(run), "sauna/0")
-    _, vex = policy.predict(found.played.observation)
+    _, vex = policy.heads(found.played.observation)
     medians, keep, rollouts = by_hand(config, vex[:, None])
     assert found.decisions.keep.tolist() == keep and found.decisions.rollouts == rollouts
     np.testing.assert_allclose(found.decisions.median, medians, rtol=1e-5)
@@ -216,7 +216,7 @@ def test_advantages_by_hand(run, found) -> None:
     reward = np.clip(found.played.reward / std, -10, 10)
     np.testing.assert_allclose(found.reward, reward, rtol=1e-12)
     policy, played = TrainedPolicy(artifact, "sauna/0"), found.played
-    value, finals = policy.predict(played.observation)[0], policy.predict(played.final)[0]
+    value, finals = policy.heads(played.observation)[0], policy.heads(played.final)[0]
     np.testing.assert_array_equal(found.value, value)
     starts = {*found.decisions.rollouts}
     later, episode, expected = 0.0, len(finals), np.zeros(len(value))

@@ -250,6 +250,7 @@ def wrong_on_device(rng: random.Random) -> Mistake:
         "raises": "cannot be played: ValueError: two lines",
         "branches": "cannot be played: TracerBool",
         "state": "its state has other arrays",
+        "observation": "observation is of shape",
     }
     import jax_worlds
 

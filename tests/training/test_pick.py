@@ -69,7 +69,7 @@ def test_a_mistake_is_found_before_the_environment_is_made() -> None:
 def test_both_interfaces_pick_and_say_so(monkeypatch, capsys, tmp_path) -> None:
     started = []
 
-    def start(overrides, display, found):
+    def start(overrides, display, *more):
         started.append(overrides)
         return SimpleNamespace(path=tmp_path)
 

@@ -1,12 +1,12 @@
-"""Fields of `Config` as flags of a command, grouped, with types and the defaults that hold."""
+"""Fields of `Config` as flags of a command and keywords of a function: types, defaults, help."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import typing
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
 from sauna.config.fields import GROUPS
 from sauna.config.presets import arm_config
@@ -15,6 +15,7 @@ from sauna.config.zoo import AUTO, entry_of
 from sauna.system.errors import BadInput
 
 FIRST = "most needed"
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def add_fields(
@@ -34,6 +35,19 @@ def add_fields(
         for name in members:
             _add_field(group, name, values[name])
         _add_accepted(group, members)
+
+
+def lists_settings(names: Iterable[str]) -> Callable[[F], F]:
+    """Makes a decorator that adds the fields to a function's docstring, for `help`."""
+    texts = (f"      {name}: {FIELDS[name].metadata['help']}" for name in names)
+    head = "\n    Settings (the preset has what is not given; `sauna train ENV --help` shows it):\n"
+    listed = head + "\n".join(texts) + "\n    "
+
+    def add(function: F) -> F:
+        function.__doc__ = (function.__doc__ or "").rstrip(" ") + listed
+        return function
+
+    return add
 
 
 def _of_preset(title: str, values: Mapping[str, Any]) -> str:

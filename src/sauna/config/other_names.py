@@ -7,9 +7,11 @@ values may count otherwise.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import Any, get_origin
 
-from sauna.config.settings import FIELDS, fields_with, flag
+from sauna.config.settings import FIELDS, TYPES, fields_with, flag
 from sauna.system.errors import nearest
 
 SAME = {
@@ -131,7 +133,21 @@ def flag_hint(argument: str, known: list[str], command: str | None) -> str:
             "; a resumed run computes what it began with: "
             "`sauna train --config RUN/config.json` trains anew with other settings"
         )
-    return _hint(name, flag) or nearest(typed, known)
+    near = nearest(typed.lstrip("-"), (other.lstrip("-") for other in known if other[:2] == "--"))
+    return _hint(name, flag) or near.replace("mean '", "mean '--")
+
+
+def spread_hint(arguments: Sequence[str], unknown: str) -> str:
+    """Writes `; ...` if an unknown argument is a further value of a list: `--seeds 0 1 2`."""
+    if unknown.startswith("-") or unknown not in arguments:
+        return ""
+    before = list(arguments[: arguments.index(unknown)])
+    options = [place for place, word in enumerate(before) if word.startswith("--")]
+    name = before[options[-1]].lstrip("-").replace("-", "_") if options else ""
+    if get_origin(TYPES.get(name, tuple[str] if name in ("arms", "rules") else None)) is not tuple:
+        return ""
+    values = [*takewhile(lambda word: not word.startswith("-"), arguments[options[-1] + 1 :])]
+    return f"; values of {flag(name)} are separated by commas: {flag(name)} {','.join(values)}"
 
 
 def _hint(name: str, spell: Any) -> str:

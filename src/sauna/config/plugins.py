@@ -18,6 +18,14 @@ STORED_BEFORE = "sauna.local"  # its name in the runs of 0.1.0
 _UNIQUE = re.compile(r"_[0-9a-f]{16}$")  # ends a part's name; older runs have names that may meet
 
 
+class NotFound(BadInput):
+    """There is no such module where Python looks."""
+
+    def __init__(self, message: str, module: str) -> None:
+        super().__init__(message)
+        self.module = module
+
+
 def import_name(key: str, path: str) -> Any:
     """The object behind `module:name`; the working directory counts as a place of modules.
 
@@ -47,7 +55,8 @@ def import_module(key: str, module_name: str, path: str) -> Any:
       path: the whole `module:name`, of which a message is made.
 
     Raises:
-      BadInput: it does not exist, is a file's name, or importing it failed.
+      NotFound: there is no such module.
+      BadInput: it is a file's name, or importing it failed.
     """
     if module_name.endswith(".py") or "/" in module_name:
         file = Path(module_name)
@@ -65,7 +74,17 @@ def import_module(key: str, module_name: str, path: str) -> Any:
     try:
         return importlib.import_module(module_name)
     except Exception as error:  # a user's module may fail in any way; all are bad input
-        raise BadInput(f"{key}: cannot import {module_name!r}: {one_line(error)}") from error
+        text = f"{key}: cannot import {module_name!r}"
+        if isinstance(error, ModuleNotFoundError) and _leads_to(error.name, module_name):
+            near = nearest(module_name, (file.stem for file in Path.cwd().glob("*.py")))
+            places = f"{Path.cwd()}, on PYTHONPATH, or among the installed packages"
+            raise NotFound(f"{text}: it is not in {places}{near}", module_name) from error
+        raise BadInput(f"{text}: {one_line(error)}") from error
+
+
+def _leads_to(missing: str | None, module_name: str) -> bool:
+    """Whether a missing module is the one that is asked for, or a package above it."""
+    return missing is not None and f"{module_name}.".startswith(f"{missing}.")
 
 
 def name_of(thing: Any) -> str:

@@ -53,9 +53,7 @@ def parse(name: str, value: Any) -> Any:
     try:
         parsed = read_value(name, value, field_type)
     except (ValueError, TypeError, KeyError, OverflowError):
-        example = f"a JSON object, such as {EXAMPLE}"
-        expected = example if name.endswith("_kwargs") else _KINDS[field_type]
-        raise BadInput(f"{name}: cannot read {value!r} as {expected}") from None
+        raise BadInput(f"{name}: cannot read {value!r} as {_expected(name, value)}") from None
     named = meta["plugin"] and ":" in str(parsed)
     if isinstance(parsed, str) and meta["choices"] and parsed not in meta["choices"] and not named:
         known = ", ".join(meta["choices"]) + (", or module:name" if meta["plugin"] else "")
@@ -64,6 +62,22 @@ def parse(name: str, value: Any) -> Any:
     for number in parsed if isinstance(parsed, tuple) else (parsed,):
         _check_bounds(name, number, meta)
     return parsed
+
+
+def _expected(name: str, value: Any) -> str:
+    """Says what the value of a field must be, where it is something else."""
+    if name.endswith("_kwargs"):
+        return f"a JSON object, such as {EXAMPLE}"
+    if name == "seeds":
+        return "a count (6 are the seeds 0 to 5) or the seeds themselves (0,1,2)"
+    kind = _KINDS[TYPES[name]]
+    if not callable(value):
+        return kind
+    schedule = FIELDS.get(f"{name}_schedule")
+    if schedule is None:
+        return f"{kind}; it does not change over the training"
+    choices = ", ".join(schedule.metadata["choices"])
+    return f"{kind}; over the training {schedule.name} changes it ({choices})"
 
 
 def _check_bounds(name: str, value: Any, meta: Mapping[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import re
 import sys
 import warnings
@@ -128,11 +128,24 @@ def _registered(env: str) -> str:
     if package is not None and name not in gymnasium.registry:
         register(package, name)
     if name not in gymnasium.registry:
-        raise BadInput(f"env: unknown environment {env!r}{nearest(name, gymnasium.registry)}")
+        hint = _with_colon(env) or nearest(name, gymnasium.registry)
+        raise BadInput(f"env: unknown environment {env!r}{hint}")
     entry = str(gymnasium.registry[name].entry_point)
     if "mujoco" in entry or entry.startswith("gymnasium_robotics"):
         tame_mujoco()
     return name
+
+
+def _with_colon(env: str) -> str:
+    """Writes `; ...` if a name is that of a class or function in a module: `my_module.MyEnv`."""
+    module, _, name = env.rpartition(".")
+    parts = module.split(".")
+    if not name.isidentifier() or not all(part.isidentifier() for part in parts):
+        return ""
+    is_here = Path(f"{parts[0]}.py").is_file() or Path(parts[0]).is_dir()
+    if not is_here and not (parts[0] in sys.modules or importlib.util.find_spec(parts[0])):
+        return ""
+    return f"; a class or function of a module is written '{module}:{name}'"
 
 
 def known_in_this_process_alone(env: str) -> bool:

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.host.answers import close, life_lost, one_number
+from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_number
 from sauna.envs.make import make_env
+from sauna.envs.shapes import check_shapes
 from sauna.envs.spaces import Spaces, describe, observation_reader
 from sauna.system.errors import BadInput, one_line
 
@@ -79,7 +80,7 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
 
     from sauna.envs.device.contract import flat
 
-    one = flat(made)
+    one = flat(_with_checked_shapes(made))
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
     try:
         state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))
@@ -99,6 +100,22 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
             raise BadInput(f"env: {env}: its {name} is not of shape {shape}")
     if _arrays(transition.state) != _arrays(state):
         raise BadInput(f"env: {env}: its state has other arrays after a step than after a reset")
+
+
+def _with_checked_shapes(env: Any) -> Any:
+    """The environment on the device, which raises if its observations are not of its space."""
+
+    def reset(key: Any) -> Any:
+        state, observation = env.reset(key)
+        check_shapes(env.observation_space, observation)
+        return state, observation
+
+    def step(state: Any, action: Any) -> Any:
+        transition = env.step(state, action)
+        check_shapes(env.observation_space, transition.observation)
+        return transition
+
+    return env._replace(reset=reset, step=step)
 
 
 def _arrays(tree: Any) -> Any:
@@ -123,9 +140,11 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
         return found
 
     env.action_space.seed(seed)
-    seen = [(read(env.reset(seed=seed)[0]), 0.0, False)]
+    seen = [(read(first_of(env.reset(seed=seed))), 0.0, False)]
     for _ in range(STEPS):
-        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        observation, reward, terminated, truncated, info = five_of(
+            env.step(env.action_space.sample())
+        )
         life_lost(info)  # raises where it cannot be read
         seen.append((read(observation), one_number(reward), bool(terminated or truncated)))
         if seen[-1][2]:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.envs.shapes import shape_check
 from sauna.system.errors import BadInput
 
 SMALLEST_IMAGE = 36  # the Nature CNN's three convolutions need this many pixels
@@ -195,7 +196,8 @@ def _channels_first(shape: tuple[int, ...]) -> bool:
 def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     """A function from the env's observation to the array of `Spaces.observation_shape`.
 
-    Vectors keep the env's precision; the collector rounds them after normalising.
+    Vectors keep the env's precision; the collector rounds them after normalising. What is flattened
+    is refused (`ValueError`) if a part has another shape than its space.
     """
     from gymnasium import spaces as gym
 
@@ -205,9 +207,18 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
         if _channels_first(space.shape):
             return lambda image: np.moveaxis(np.asarray(image), 0, -1)
         return np.asarray
-    if isinstance(space, gym.Box):
-        return np.asarray if len(space.shape) == 1 else lambda x: np.asarray(x).reshape(-1)
-    return lambda x: gym.flatten(space, x)
+    if isinstance(space, gym.Box) and len(space.shape) == 1:
+        return np.asarray
+
+    check = shape_check(space)
+
+    def read(observation: Any) -> np.ndarray:
+        check(observation)
+        if isinstance(space, gym.Box):
+            return np.asarray(observation).reshape(-1)
+        return gym.flatten(space, observation)
+
+    return read
 
 
 def action_writer(space: Any, rescale: bool = False) -> Callable[[np.ndarray], Any]:

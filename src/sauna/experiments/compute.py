@@ -3,7 +3,8 @@
 Compute is a count that only grows along a curve: samples through the gradient, or CPU seconds of
 the learner. The level to reach is the baseline's mean final return. An arm's compute is that of the
 first point where its mean curve is at the level; the baseline's is found in the same way, so that
-an arm that is the baseline has the ratio 1, however early the baseline levels off.
+an arm that is the baseline has the ratio 1, however early the baseline levels off. A baseline that
+has not risen above its start gives no level: any arm is there at once.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.experiments.statistics import QUANTILES, SEED
+from sauna.experiments.statistics import QUANTILES, SEED, mean_interval
 
 RESAMPLES = 2_000
 GRID = 60  # points of a drawn curve at most
@@ -112,6 +113,15 @@ def reached(x: np.ndarray, mean: np.ndarray, level: np.ndarray) -> np.ndarray:
         (first > 0) & np.isfinite(low), x[before] + share * (x[first] - x[before]), x[first]
     )
     return np.where(above.any(-1), found, np.inf)
+
+
+def has_risen(baseline: Curves) -> bool:
+    """Whether the seeds' last returns stand above their first ones by more than their noise: the
+    95% interval of the mean rise is above 0. With one seed there is none, and the answer is no.
+    """
+    first = np.array([seed[np.isfinite(seed)][0] for seed in baseline.y])
+    _, low, _ = mean_interval((baseline.y[:, -1] - first)[:, None])
+    return bool(low[0] > 0)
 
 
 def compute_ratio(arm: Curves, baseline: Curves) -> Ratio:

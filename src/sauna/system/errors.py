@@ -26,9 +26,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`; did you mean X?` for the known word closest to `word`, or an empty string."""
-    found = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f"; did you mean {found[0]!r}?" if found else ""
+    """`; did you mean X?` for the known word closest to `word`, or an empty string.
+
+    Capitals are no difference; a word that shares little is not suggested.
+    """
+    spelled = {name.lower(): name for name in known}
+    found = difflib.get_close_matches(word.lower(), list(spelled), n=1, cutoff=0.6)
+    return f"; did you mean {spelled[found[0]]!r}?" if found else ""
 
 
 def one_line(error: BaseException) -> str:

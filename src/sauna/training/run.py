@@ -14,6 +14,7 @@ from typing import IO, Any
 
 from sauna.config.checks import cautions, check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
+from sauna.config.imported_from import KEY, folders_of, names_the_folder
 from sauna.config.own_sources import newer_sources
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import Member, parse_all, plain, resolve_run
@@ -130,6 +131,8 @@ def start(
         "machine": run_directory.machine(),
         **({"initial": initial[1]} if initial else {}),
     }
+    if folders := folders_of(stored):
+        stored[KEY] = folders
     stored["seal"] = seal(stored)
     with disk_errors(path):
         run = Run(path, prepared, made)
@@ -205,9 +208,10 @@ def follow(overrides: Mapping[str, Any], display: Display) -> None:
     train_members(prepared.job(), Follower(display.say))
 
 
+@names_the_folder
 @kept_folder()
 def reopen(
-    path: Path,
+    path: str | Path,
     changes: Mapping[str, Any],
     display: Display,
     trust: bool = False,

@@ -12,10 +12,11 @@ import sauna
 import worlds
 from helpers import SMALL
 from sauna import cli
+from sauna.config.plugins import name_of
 from sauna.experiments.evaluate import episodes, play
 from sauna.experiments.evaluate.episodes import VideoFailure, kwargs_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
-from sauna.experiments.evaluate.video import frame, frames_per_second, video
+from sauna.experiments.evaluate.video import check_drawn, frame, frames_per_second, video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training.artifact import load_artifact
@@ -75,6 +76,23 @@ def test_any_kept_checkpoint_can_be_played_and_loaded(run: Path, capsys) -> None
         sauna.load(run, checkpoint=9)
     cli.main(["eval", str(run), "--episodes", "1", "--checkpoint", "2"])
     assert "checkpoint of iteration 2" in capsys.readouterr().out
+
+
+def test_a_batch_gives_the_actions_of_its_observations(run: Path) -> None:
+    policy = sauna.load(run)
+    many = np.linspace(-1, 1, 12).reshape(4, 3)
+    np.testing.assert_allclose(policy(many), [policy(one) for one in many], rtol=1e-6)
+    action, state = policy.predict(many[0], deterministic=True)
+    assert state is None
+    np.testing.assert_array_equal(action, policy(many[0]))
+    drawn = [policy.predict(many)[0] for _ in range(2)]
+    assert drawn[0].shape == policy(many).shape and not np.array_equal(*drawn)
+    again = sauna.load(run)
+    again.predict(many[0], deterministic=True)  # counts as a call
+    np.testing.assert_array_equal(again.predict(many)[0], drawn[0])
+    for wrong in (np.ones(4), np.ones((1, 20)), {"goal": np.ones(3)}, np.ones((0, 3))):
+        with pytest.raises(BadInput, match=r"expected \(3,\), one observation or a batch|is empty"):
+            policy(wrong)
 
 
 def test_the_best_policy_is_that_of_the_best_evaluation(run: Path, endless: Path, capsys) -> None:
@@ -148,6 +166,15 @@ def test_render_mode_and_size_among_the_arguments_can_be_filmed(endless: Path) -
     arguments = {"env_kwargs": {"render_mode": None, "size": 33}, "max_steps": 3, "episodes": 1}
     result = sauna.evaluate(endless, video=True, **arguments)
     assert imageio.imread(result["video"]).shape == (4, 34, 38, 3)
+
+
+def test_what_has_pictures() -> None:
+    check_drawn("worlds:Never", {})
+    check_drawn("worlds:Never", {"breaks": 1})  # whether it can be drawn is another question
+    without_render = name_of(lambda **kwargs: worlds.Scripted())
+    for env in ("worlds:Scripted", "jax_worlds:make_walk", without_render):
+        with pytest.raises(BadInput, match=r"takes render_mode='rgb_array' and has render\(\)"):
+            check_drawn(env, {})
 
 
 @pytest.mark.parametrize("rate", [None, 0, "fast", float("nan"), -3])

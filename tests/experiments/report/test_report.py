@@ -324,6 +324,14 @@ def test_no_two_labels_look_alike() -> None:
     assert found["sauna"].colour == style.COLOURS["sauna"]  # an arm's own name comes first
 
 
+def test_a_rule_beside_ppo_has_another_marker_and_no_blue() -> None:
+    arms = ("ppo", "top-advantage", "top-advantage+random", "gigaflow")
+    found = style.looks({arm: arm for arm in arms})
+    assert len({look.marker for look in found.values()}) == len(arms)
+    red, _, blue = (int(found["top-advantage"].colour[i : i + 2], 16) for i in (1, 3, 5))
+    assert red > blue
+
+
 def line(label: str, x: list[float], y: list[float | None]) -> Line:
     return Line(label, [*x], y, [None] * len(x), [None] * len(x), [])
 

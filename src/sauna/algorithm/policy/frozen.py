@@ -1,4 +1,4 @@
-"""A policy whose parameters and normaliser stay as they are, one raw observation at a time."""
+"""A policy whose parameters and normaliser stay as they are, at raw observations."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Array
 from sauna.config.settings import Config
+from sauna.envs.shapes import batch_size, one_of
 from sauna.envs.spaces import Spaces, action_writer, observation_reader
+from sauna.system.errors import BadInput
 
 
 class FrozenPolicy:
-    """`policy(observation) -> action` for one raw observation of the environment.
+    """`policy(observation) -> action` for a raw observation of the environment, or a batch.
 
     The action is the distribution's mode unless `deterministic=False` and a key are given.
 
@@ -27,6 +29,7 @@ class FrozenPolicy:
 
     def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
         self.config = config
+        self._space = env.observation_space
         self._read = observation_reader(env.observation_space)
         self.write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
@@ -49,27 +52,55 @@ class FrozenPolicy:
         return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
 
     def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
-        """The action for one raw observation, clipped or stretched as the environment wants it.
+        """The action for a raw observation, clipped or stretched as the environment wants it.
 
-        Sampled actions need a JAX `key`; the normaliser is never updated.
+        A batch of observations (each array with one more axis, in front) gives an array of actions.
+        Each new size of a batch is compiled once. Sampled actions need a JAX `key`; the normaliser
+        is never updated.
+
+        Raises:
+          BadInput: `observation` is not of the environment's space.
         """
-        return self.write(self.act(observation, deterministic=deterministic, key=key))
+        rows, is_batch = self._rows(observation)
+        actions = self._choices(rows, deterministic, key)
+        if is_batch:
+            return np.stack([np.asarray(self.write(action)) for action in actions])
+        return self.write(actions[0])
 
     def act(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> np.ndarray:
         """What the network chooses for one raw observation `[A]`, neither clipped nor stretched."""
+        return self._choices(self._read(observation)[None], deterministic, key)[0]
+
+    def _choices(self, rows: np.ndarray, deterministic: bool, key: Any) -> np.ndarray:
+        """What the network chooses for raw observations `[n, *obs]`: `[n, A]`."""
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
         key = jax.random.key(0) if key is None else key
-        seen = self.see(observation)[None]
-        action = self._act(self.params, seen, key, deterministic=deterministic)
-        return np.asarray(action)[0]
+        seen = self._seen(rows)
+        return np.asarray(self._act(self.params, seen, key, deterministic=deterministic))
+
+    def _rows(self, observation: Any) -> tuple[np.ndarray, bool]:
+        """Raw observations as arrays `[n, *obs]`, and whether they came as a batch."""
+        try:
+            size = batch_size(self._space, observation)
+        except ValueError as error:
+            raise BadInput(str(error)) from None
+        if size is None:
+            return self._read(observation)[None], False
+        if size == 0:
+            raise BadInput("the batch of observations is empty")
+        ones = (one_of(self._space, observation, index) for index in range(size))
+        return np.stack([self._read(one) for one in ones]), True
 
     def see(self, observation: Any) -> np.ndarray:
         """What the network gets of one raw observation `[*obs]`: float32, normalised; or uint8."""
-        seen = self._read(observation)[None]
+        return self._seen(self._read(observation)[None])[0]
+
+    def _seen(self, rows: np.ndarray) -> np.ndarray:
+        """What the network gets of raw observations `[n, *obs]`."""
         if self._moments is not None:
-            seen = normalize(self._moments, seen, self.config.clip_observations)
-        return seen[0].astype(self._dtype)
+            rows = normalize(self._moments, rows, self.config.clip_observations)
+        return rows.astype(self._dtype)
 
     def _heads(self, params: Array, observation: Any) -> Any:
         output = self.policy.apply(params, observation)

@@ -53,6 +53,11 @@ class HostFace(gymnasium.Env):
     def _read(self, observation: Any) -> Any:
         return jax.tree.map(np.asarray, observation)
 
+    @property
+    def is_drawn(self) -> bool:
+        """Whether it has pictures."""
+        return self._env.render is not None
+
     def render(self) -> Any:
         if self.render_mode is None or self._env.render is None:
             return None

@@ -26,7 +26,7 @@ def one_number(reward: Any) -> float:
     number = found.size == 1 and found.dtype.kind != "c"
     if not number or not hasattr(found.reshape(-1)[0], "__float__"):
         what = f"of shape {found.shape}" if found.ndim else f"{reward!r:.40}"
-        raise ValueError(f"the reward is {what}, not one number")
+        raise ValueError(f"the reward from step() is {what}, not one number")
     return float(found.reshape(-1)[0])
 
 
@@ -46,6 +46,37 @@ def life_lost(info: Any) -> bool:
     return bool(np.asarray(lost).reshape(()))
 
 
+def five_of(answer: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """What `step()` returned, which must be Gymnasium's five values.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    if isinstance(answer, tuple) and len(answer) == 5:
+        return answer
+    raise ValueError(
+        "step() must return observation, reward, terminated, truncated, info; it returned "
+        f"{_counted(answer)}"
+    )
+
+
+def first_of(answer: Any) -> Any:
+    """The observation of what `reset()` returned, which must be Gymnasium's two values.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    if isinstance(answer, tuple) and len(answer) == 2:
+        return answer[0]
+    raise ValueError(f"reset() must return observation, info; it returned {_counted(answer)}")
+
+
+def _counted(answer: Any) -> str:
+    if isinstance(answer, tuple):
+        return f"{len(answer)} value{'' if len(answer) == 1 else 's'}"
+    return "nothing" if answer is None else f"one {type(answer).__name__}"
+
+
 def reset_with(env: Any, seed: int) -> Any:
     """The first observation of the episode of `seed`, a number below 2^32.
 
@@ -53,11 +84,12 @@ def reset_with(env: Any, seed: int) -> Any:
     bits instead.
     """
     try:
-        return env.reset(seed=seed)[0]
+        answer = env.reset(seed=seed)
     except Exception as error:
         if seed <= MAX_SIGNED or not _is_of_seed(error, seed):
             raise
-    return env.reset(seed=seed & MAX_SIGNED)[0]
+        answer = env.reset(seed=seed & MAX_SIGNED)
+    return first_of(answer)
 
 
 def _is_of_seed(error: Exception, seed: int) -> bool:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sauna.envs.host.answers import close, life_lost, one_number, reset_with
+from sauna.envs.host.answers import close, five_of, life_lost, one_number, reset_with
 from sauna.envs.host.contract import HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.info import numbers_of
 from sauna.envs.spaces import action_writer, describe, observation_reader
@@ -131,7 +131,7 @@ class GymnasiumEnvs(HostEnvs):
         """Steps one environment; whether its episode ended, or a life of it was lost."""
         slot.actions.append(action)
         try:
-            observation, given, terminated, truncated, info = self._take(slot, action)
+            observation, given, terminated, truncated, info = five_of(self._take(slot, action))
             self._reward[index] = one_number(given)
             lost = life_lost(info)
         except Exception as error:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.play import Progress
-from sauna.experiments.evaluate.video import record_video
+from sauna.experiments.evaluate.video import check_drawn, record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.working_folder import kept_folder
@@ -39,6 +40,7 @@ class VideoFailure(SaunaError):
         self.result = result
 
 
+@names_the_folder
 @kept_folder()
 def evaluate(
     run: str | Path,
@@ -82,8 +84,8 @@ def evaluate(
       `{"mode", "env", "seed", "members": {name: {"returns", "lengths", "mean", ...}}}`.
 
     Raises:
-      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces, or
-        with `best`, a member was not evaluated during training.
+      BadInput: no such run, member or checkpoint, impossible numbers, `env` has other spaces; with
+        `best`, a member was not evaluated during training; with `video`, `env` has no pictures.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
     run = Path.cwd() / run  # an environment may go elsewhere
@@ -105,6 +107,8 @@ def evaluate(
     kwargs = kwargs_of(artifact, env, env_kwargs)
     if env_kwargs:
         result["env_kwargs"] = kwargs
+    if video:
+        check_drawn(result["env"], kwargs)
     made = make_env(result["env"], kwargs)
     check_spaces(artifact, made)
     from sauna.algorithm.rollout.play import play, success_rate  # imports JAX: after the checks

@@ -18,11 +18,11 @@ from sauna.system.checkpoint import BadCheckpoint
 from sauna.training.artifact import Artifact, best_of, check_spaces, find_member
 from sauna.training.loop.member_state import fitting, flat_params, under
 
-CHUNK = 512  # observations of one call of `predict`: one compiled shape, and bounded memory
+CHUNK = 512  # observations of one call of `heads`: one compiled shape, and bounded memory
 
 
 class TrainedPolicy(FrozenPolicy):
-    """`policy(observation) -> action` for one raw observation of the environment.
+    """`policy(observation) -> action` for a raw observation of the environment, or a batch.
 
     The action is the distribution's mode unless `deterministic=False` and a key are given.
 
@@ -65,8 +65,33 @@ class TrainedPolicy(FrozenPolicy):
                 }
             )
         self.load(params, moments)
+        self._calls = 0  # of `predict`
 
-    def predict(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, None]:
+        """The same with the arguments, the default and the answer of Stable-Baselines3's `predict`.
+
+        Sampled actions follow from how many calls there were before.
+
+        Args:
+          state, episode_start: of recurrent policies, which there are none of; not read.
+
+        Returns:
+          `(action, None)`.
+
+        Raises:
+          BadInput: as a call of the policy.
+        """
+        key = jax.random.fold_in(jax.random.key(0), self._calls)
+        self._calls += 1
+        return self(observation, deterministic=deterministic, key=key), None
+
+    def heads(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V and the Vex head, `[L]` each, at what the network got `[L, *obs]`."""
         value, vex = _in_chunks(partial(self._predict, self.params), seen)
         return value, vex

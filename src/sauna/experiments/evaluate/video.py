@@ -14,10 +14,42 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.host.answers import close
-from sauna.envs.make import make_drawn_env
-from sauna.system.errors import SaunaError, one_line
+from sauna.envs.make import make_drawn_env, make_env
+from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.safe_write import own_folder, replacing
 from sauna.training.artifact import Artifact
+
+NEEDED = "video: a video needs an environment that takes render_mode='rgb_array' and has render()"
+
+
+def check_drawn(env: str, env_kwargs: dict[str, Any]) -> None:
+    """Refuses an environment that has no pictures, before anything is played.
+
+    Whether this machine can draw them is not asked.
+
+    Raises:
+      BadInput: it does not take `render_mode`, or has no `render()` of its own.
+    """
+    try:
+        made = make_drawn_env(env, env_kwargs)
+    except BadInput as error:
+        if not isinstance(error.__cause__, TypeError):
+            return  # said when it is drawn
+        close(make_env(env, env_kwargs))  # or it is not for the keyword
+        raise BadInput(NEEDED) from error
+    own = getattr(made, "unwrapped", made)
+    is_drawn = has_render(own)
+    close(made)
+    if not is_drawn:
+        raise BadInput(NEEDED)
+
+
+def has_render(env: Any) -> bool:
+    """Whether an environment has a `render()` beside Gymnasium's, which raises."""
+    import gymnasium
+
+    own = getattr(env, "is_drawn", True)  # of an environment on the device
+    return own and getattr(type(env), "render", gymnasium.Env.render) is not gymnasium.Env.render
 
 
 def record_video(

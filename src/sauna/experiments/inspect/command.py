@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from sauna.config.imported_from import names_the_folder
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.system.errors import BadInput
 from sauna.system.safe_write import replace_file
@@ -12,6 +13,7 @@ from sauna.system.working_folder import kept_folder
 from sauna.training.artifact import find_member, load_artifact
 
 
+@names_the_folder
 @kept_folder()
 def inspect(
     run: str | Path,

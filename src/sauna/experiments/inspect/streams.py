@@ -62,12 +62,12 @@ def stream_of(
     policy: TrainedPolicy, config: Config, own: Mapping[str, np.ndarray], played: Played
 ) -> Rollout:
     """A play as the collector would hand it on, `[L]`; `own` are the member's arrays."""
-    value, vex = policy.predict(played.observation)
+    value, vex = policy.heads(played.observation)
     ends = np.flatnonzero(played.terminated | played.truncated)
     if len(played.final) > len(ends):
         ends = np.append(ends, len(value) - 1)  # the episode was left there
     next_value = np.append(value[1:], 0.0).astype(np.float32)
-    after = policy.predict(played.final)[0]
+    after = policy.heads(played.final)[0]
     next_value[ends] = np.where(played.terminated[ends], 0.0, after)
     columns: dict[str, Any] = {
         "observation": played.observation,

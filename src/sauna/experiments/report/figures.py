@@ -94,8 +94,9 @@ _CURVES: tuple[tuple[str, str, str, str, str, tuple[float, float] | None], ...] 
         "learning_curves",
         "return_mean",
         "Learning curves",
-        TRAINING_RETURN + " Line: mean of the seeds; band: 95% "
-        "interval, of fewer than three seeds each seed instead.",
+        TRAINING_RETURN + " Line: mean of the seeds. Band: its 95% interval by Student's t, which "
+        "is not the table's: that is a bootstrap of the IQM, narrower with few seeds. Of fewer "
+        "than three seeds each seed is drawn instead.",
         "return",
         None,
     ),

@@ -26,8 +26,8 @@ COLOURS = {
     "sauna-reference": "#009E73",
     "sauna+random": "#999999",
 }
-_OTHER_ARMS = ("#56B4E9", "#882255", "#997700", "#4B5563")
-_MARKERS = ("o", "s", "D", "^", "v", "P", "X")  # matplotlib's names; one for each arm
+_OTHER_ARMS = ("#882255", "#997700", "#4B5563", "#56B4E9")  # the one near ppo's blue last
+_MARKERS = ("o", "s", "D", "^", "v", "P", "X")  # matplotlib's names; the round one is ppo's
 _DASHES: tuple[tuple[float, ...], ...] = ((), (6, 2.5), (1.5, 2), (8, 2.5, 1.5, 2.5))
 _SHADES = (0.0, 0.45, -0.45, 0.65)  # towards black, white if negative
 
@@ -83,8 +83,11 @@ def looks(arms: Mapping[str, str]) -> dict[str, Look]:
     found = {}
     for label in sorted(arms, key=lambda label: label != arms[label]):
         arm = arms[label]
-        place = len(COLOURS) + unknown.index(arm) if arm in unknown else [*COLOURS].index(arm)
-        colour = COLOURS.get(arm) or _OTHER_ARMS[unknown.index(arm) % len(_OTHER_ARMS)]
+        if arm in unknown:
+            index = unknown.index(arm)
+            place, colour = 1 + index % (len(_MARKERS) - 1), _OTHER_ARMS[index % len(_OTHER_ARMS)]
+        else:
+            place, colour = [*COLOURS].index(arm), COLOURS[arm]
         number = drawn.get(colour, 0)
         drawn[colour] = number + 1
         shade = _SHADES[number % len(_SHADES)]

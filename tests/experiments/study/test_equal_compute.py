@@ -1,0 +1,53 @@
+"""What is said of arms at equal compute, and of what nothing is said."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sauna.experiments.study.cells import Cell
+from sauna.experiments.study.equal_compute import compute_verdicts
+
+X = [0.0, 50.0, 100.0]
+
+
+def cell(label: str, *seeds: list[float], baseline: str | None = "ppo") -> Cell:
+    members: list[dict[str, Any]] = [
+        {"curve": {"samples_backward": X, "return_mean": seed}} for seed in seeds
+    ]
+    return Cell("A-v0", label, label, baseline, members, 0, 0, 0)
+
+
+def said(*cells: Cell) -> list[str]:
+    return [verdict["text"] for verdict in compute_verdicts(cells)]
+
+
+BASE = cell("ppo", [0.0, 5.0, 10.0], [0.0, 5.0, 11.0], [0.0, 6.0, 12.0], baseline=None)
+
+
+def test_an_arm_that_is_there_sooner() -> None:
+    (text,) = said(BASE, cell("mine", [0.0, 22.0, 30.0], [0.0, 22.0, 30.0], [0.0, 22.0, 30.0]))
+    # 11 of 22 is half of the way to 50: a quarter of ppo's 100.
+    assert text.startswith("mine: reaches ppo's final return on A-v0 with 0.25 of ppo's learner")
+
+
+def test_nothing_is_said_of_a_baseline_that_has_not_learnt() -> None:
+    """Two rows of noise: every arm is at the level at once."""
+    flat = cell("ppo", [4.0, 5.0, 4.9], [4.0, 3.0, 3.8], baseline=None)
+    arms = [cell(name, [3.0, 5.0, 4.0], [4.0, 5.0, 5.0]) for name in ("mine", "mine+random")]
+    (text,) = said(flat, *arms)
+    assert text.startswith("ppo: its return on A-v0 has not risen")
+
+
+def test_an_open_interval_is_not_decided() -> None:
+    (text,) = said(BASE, cell("mine", [0.0, 30.0, 30.0], [0.0, 2.0, 3.0], [0.0, 9.0, 9.0]))
+    assert text.startswith("mine: not decided how much it takes to reach ppo's final return")
+    assert text.endswith(", not reached].")
+    (text,) = said(BASE, cell("mine", [0.0, 12.0, 14.0], [0.0, 2.0, 3.0], [0.0, 9.0, 9.0]))
+    assert "not decided" in text and "not reached by the mean, of ppo's learner compute [" in text
+
+
+def test_an_arm_that_never_gets_there() -> None:
+    (text,) = said(BASE, cell("mine", [0.0, 2.0, 3.0], [0.0, 2.0, 3.0]))
+    assert text == "mine: does not reach ppo's final return on A-v0."
+    (text,) = said(BASE, cell("mine", [0.0, 22.0, 30.0]))  # one seed
+    assert text.endswith("0.25 of ppo's learner compute, no interval.")
