@@ -169,7 +169,7 @@ def write_pages() -> None:
         (PAGES / "selection.md").write_text(text)
     covered = json.loads((ROOT / "results" / "intervals.json").read_text())["iqm_of_normals"]["6"]
     (PAGES / "index.md").write_text(index(covered))
-    insert(ROOT / "README.md", "findings", findings("docs/results/"))
+    insert(ROOT / "README.md", "findings", findings("docs/results/", short=True))
     if results := load("fig3"):
         readmes_picture(results)
         (PAGES / "ppo.md").write_text(ppo_page(results))

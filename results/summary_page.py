@@ -28,6 +28,7 @@ from studies import (
 from sauna.experiments.study.spec import load_spec
 
 # The summary's rows: the claim in short, its number in `CLAIMS`, the arm that is judged.
+_SHORT = ("sauna-paper", "sauna 0.8", "vex-head")  # judged in the README
 _VARIANTS = ("sauna-paper", "sauna-reference", "sauna-reference, kept steps", "sauna", "sauna 0.8")
 CLAIM_ROWS = (
     *(("SAUNA scores higher than PPO", 0, arm) for arm in _VARIANTS),
@@ -39,14 +40,17 @@ CLAIM_ROWS = (
 )
 
 
-def findings(prefix: str) -> str:
+def findings(prefix: str, short: bool = False) -> str:
     """One table: what the paper says, a short answer, and the pages behind it.
 
     Args:
       prefix: path from the page that shows the table to `docs/results/`.
+      short: leave out the variants that the README does not show.
     """
     rows, last = [["Claim", "Arm", "Answer", "Pages"]], ""
     for text, claim, label in CLAIM_ROWS:
+        if short and label not in _SHORT:
+            continue
         counts: dict[str, Count] = {}
         pages = []
         for name, tasks in CLAIMED.items():

@@ -94,7 +94,10 @@ BAD = [
     (["train", WORLD, "--target-kl", "0.01", "--algorithm", "a2c"], "stop: not read"),
     (["train", WORLD, "--optimizer", "adamv"], "did you mean 'adam'"),
     (["train", WORLD, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),
-    (["train", WORLD, "--seeds", "1.5"], "seeds: cannot read '1.5' as whole numbers, separated by"),
+    (
+        ["train", WORLD, "--seeds", "1.5"],
+        "seeds: cannot read '1.5' as a count (6 are the seeds 0 to 5)",
+    ),
     (["train", WORLD, "--env-kwargs", "[1]"], "cannot read '[1]' as a JSON object, such as '{"),
     (["train", WORLD, "--lr-schedule", "x"], "here it is '--learning-rate-schedule'"),
     (["train", WORLD, "--seed", "1,2"], "seed: cannot read '1,2' as a whole number"),
@@ -260,7 +263,7 @@ def test_help_shows_what_most_need_first_with_types_and_the_presets_values() -> 
 def test_compare_says_its_own_defaults() -> None:
     text = help_of("compare")
     assert "or which ones (100,101,110) (default 6)" in text
-    assert "(default sauna)" in text and "(default ppo,vex-head,sauna+random,sauna)" in text
+    assert "(default sauna)" in text and "(default ppo,vex- head,sauna+random,sauna)" in text
 
 
 def test_one_seed_and_samples_per_minibatch() -> None:

@@ -52,7 +52,7 @@ def test_values_of_a_list_that_are_spread_over_arguments(
     "name, value, said",
     [
         ("learning_rate", lambda left: left, "number; over the training learning_rate_schedule"),
-        ("clip_range", lambda left: left, "a number; it does not change over the training"),
+        ("value_coef", lambda left: left, "a number; it does not change over the training"),
         ("seeds", "0-2", r"a count \(6 are the seeds 0 to 5\) or the seeds themselves \(0,1,2\)"),
         ("seeds", "first", "or the seeds themselves"),
         ("steps", "many", "a whole number$"),

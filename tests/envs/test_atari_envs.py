@@ -225,7 +225,8 @@ def test_a_lost_life_ends_what_is_learned_and_not_what_is_told() -> None:
     collector.start()
     params = np.asarray(program.policy.init(keys.init))[None]
     hypers = Hypers(*(np.float32(getattr(job.config, name)) for name in Hypers._fields))
-    rollout, *_, episodes = collector.collect(params, [hypers], 0, np.array([12]))[0]
+    collected = collector.collect(params, [hypers], 0, np.array([12]))[0]
+    rollout, episodes = collected.rollout, collected.episodes
     np.testing.assert_array_equal(rollout.terminated[:, 0], [False, True] * 6)
     assert not rollout.truncated.any() and not rollout.next_value[1::2].any()
     assert rollout.reward[:, 0].tolist() == [1.0, -1.0] * 6, "signs are learned from"

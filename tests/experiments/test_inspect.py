@@ -124,7 +124,7 @@ def test_lost_lives_and_signs_are_what_is_learned() -> None:
         see=np.asarray,
         act=lambda observation, deterministic, key: np.array([1]),
         write=lambda action: action[0],
-        predict=lambda x: (np.zeros(len(x)), None),
+        heads=lambda x: (np.zeros(len(x)), None),
         log_prob=lambda seen, action: np.zeros(len(seen)),
     )
     recorder = Recorder(Lives(), policy, None)

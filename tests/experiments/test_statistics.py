@@ -7,7 +7,6 @@ import json
 import math
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -88,12 +87,10 @@ def test_bootstrap_of_two_values_by_hand() -> None:
     assert s.iqm_estimate([np.array([0.0, 1.0])]) == (0.5, 0.0, 1.0)
 
 
-def test_same_scores_give_the_same_digits_and_fast() -> None:
+def test_same_scores_give_the_same_digits() -> None:
     random = np.random.default_rng(0)
     x, y = random.normal(size=(2, 6, 6))
-    began = time.perf_counter()
     first = [s.iqm_estimate(list(x)), s.improvement_over_tasks(list(zip(x, y, strict=True)))]
-    assert time.perf_counter() - began < 1
     np.random.seed(1)
     again = [s.iqm_estimate(list(x)), s.improvement_over_tasks(list(zip(x, y, strict=True)))]
     assert repr(first) == repr(again)

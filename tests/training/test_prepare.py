@@ -30,7 +30,7 @@ def test_all_arms_have_what_the_environment_and_the_machine_decided() -> None:
 
 def test_a_worker_gets_the_members_that_the_run_has() -> None:
     prepared = prepare({"env": WORLD, "arm": "ppo,vex-head", "seeds": 2, "vex_coef": 0.7})
-    header = write_job(prepared.run, prepared.spaces, [1, 2], 3, True)
+    header = write_job(prepared.run, prepared.spaces, [1, 2], 3, True, False)
     job = read_job(header, {})
     assert job == prepared.job([1, 2], start=3)
     assert [member.config.vex_coef for member in job.members] == [0.0, 0.7]

@@ -143,13 +143,12 @@ def test_run_directories_are_read_arm_by_arm(tmp_path: Path) -> None:
 
 def test_evaluations_are_drawn_beside_the_training_return(tmp_path: Path, monkeypatch) -> None:
     drawn: list[tuple[str, list[float]]] = []
-    monkeypatch.setattr(
-        curve,
-        "_draw_arm",
-        lambda axes, label, members, look: drawn.append(
-            (label, [y for _, line in members.values() for y in line])
-        ),
-    )
+
+    def note(axes, label, members, look) -> None:
+        axes.plot([0], [0], label=label)
+        drawn.append((label, [y for _, line in members.values() for y in line]))
+
+    monkeypatch.setattr(curve, "_draw_arm", note)
     rows = [
         {"arm": "ppo", "member": "ppo/0", "seed": 0, "iteration": i, "env_steps": 10 * i}
         | {"return_mean": float(i)}

@@ -6,6 +6,7 @@ import numpy as np
 
 from sauna.config.parsing import many_seeds
 from sauna.config.settings import to_json
+from sauna.config.zoo import entry_for
 from sauna.experiments.statistics import compare
 from sauna.experiments.study.cells import Cell
 from sauna.experiments.study.spec import Arm, Spec, check
@@ -13,11 +14,19 @@ from sauna.experiments.study.verdicts import families_of, least_of
 
 
 def before_training(spec: Spec) -> list[str]:
-    """Says if a study has too few seeds to find any difference, or surprisingly many."""
+    """Says which presets are picked, and if seeds are too few for any difference, or very many."""
     notes = [note for arm in spec.arms if (note := many_seeds(arm.seeds))]
+    notes += [note for arm in spec.arms for note in _picked(arm)]
     for task in spec.tasks:
         notes += _too_few(task, {arm.label: arm for arm in spec.arms if task in arm.tasks})
     return list(dict.fromkeys(notes))
+
+
+def _picked(arm: Arm) -> list[str]:
+    """Says which presets `auto` stands for in an arm."""
+    picked = {task: entry_for({**arm.settings, "env": task}) for task in arm.tasks}
+    named = "steps" in arm.settings
+    return [entry.said(task, named) for task, entry in picked.items() if entry]
 
 
 def _too_few(task: str, arms: dict[str, Arm]) -> list[str]:
