@@ -25,7 +25,9 @@ def package(tmp_path: Path) -> Path:
     folder = tmp_path / "src" / "sauna"
     for name in own_sources.COMPUTING:
         (folder / name).mkdir(parents=True)
-    (folder / "__init__.py").write_text("")
+    (folder / "config").mkdir()
+    for name in ("__init__.py", "config/hints.py", *own_sources.DEFAULTS):
+        (folder / name).write_text("")
     (folder / "cli.py").write_text("")
     (folder / "algorithm" / "rule.py").write_text("SHARE = 0.5\n")
     _git(tmp_path, "init", "-q")
@@ -54,6 +56,16 @@ def test_an_edit_of_a_rule_and_its_undoing_are_told(package: Path) -> None:
     (package / "cli.py").write_text("# computes nothing\n")
     assert {KEY: sources_of(package)} == clean
     (package / "algorithm" / "new.py").write_text("")  # not yet added
+    assert edited_sources(clean, {KEY: sources_of(package)})
+
+
+@pytest.mark.parametrize("name", own_sources.DEFAULTS)
+def test_an_edited_default_is_told_as_no_name_of_a_run_holds_it(package: Path, name: str) -> None:
+    assert (own_sources.PACKAGE / name).is_file()
+    clean = {KEY: sources_of(package)}
+    (package / "config" / "hints.py").write_text("# decides no number\n")
+    assert {KEY: sources_of(package)} == clean
+    (package / name).write_text("gae_lambda = 0.9\n")
     assert edited_sources(clean, {KEY: sources_of(package)})
 
 

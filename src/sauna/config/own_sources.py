@@ -17,7 +17,9 @@ from pathlib import Path
 
 KEY = "sauna"
 PACKAGE = Path(__file__).parents[1]
-COMPUTING = ("algorithm", "envs", "training/loop")  # folders whose code decides a run's numbers
+# What decides a run's numbers: folders of code, and the defaults that no name of a run holds.
+COMPUTING = ("algorithm", "envs", "training/loop")
+DEFAULTS = ("config/options.py", "config/run_options.py", "config/arms.py")
 EDITED = "+changes"
 
 
@@ -61,6 +63,7 @@ def _parts(code: Mapping[str, str]) -> tuple[str, str] | None:
 def _digest(package: Path) -> str:
     found = hashlib.sha256()
     files = [path for name in COMPUTING for path in (package / name).rglob("*.py")]
+    files += [package / name for name in DEFAULTS]
     for path in sorted(files, key=lambda path: path.relative_to(package).as_posix()):
         content = path.read_bytes()
         found.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode())
@@ -73,7 +76,7 @@ def _revision(package: Path) -> str:
     try:
         _git(package, "ls-files", "--error-unmatch", "--", "__init__.py")
         revision = _git(package, "rev-parse", "--short=12", "HEAD")
-        edited = _git(package, "status", "--porcelain", "--", *COMPUTING)
+        edited = _git(package, "status", "--porcelain", "--", *COMPUTING, *DEFAULTS)
     except (OSError, subprocess.SubprocessError):
         return _version()
     return revision + (EDITED if edited else "")
