@@ -234,8 +234,8 @@ def test_a_run_of_0_1_0_that_repeats_drop_rates_is_played_and_not_resumed(tmp_pa
         frames=False,
         say=print,
     )
-    assert found.trained_keep_rate == pytest.approx(0.6, abs=0.2)
-    assert found.hypers.drop_rate == pytest.approx(1 - found.trained_keep_rate)
+    assert found.last["keep_rate"] == pytest.approx(0.6, abs=0.2)
+    assert found.hypers.drop_rate == pytest.approx(1 - found.last["keep_rate"])
     assert 0.3 < found.decisions.keep.mean() < 0.9
     assert len(evaluate(run, episodes=1)["members"]["random-drop/0"]["returns"]) == 1
     before = _tree(run)
