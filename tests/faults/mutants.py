@@ -208,9 +208,7 @@ MUTANTS = [
         ("starts with a whole sample", "1e-4)", "1.0)"),
         (
             "inactive rows count",
-            'nothing changes.\n    """\n    weight = active[..., None]\n'
             "    number = weight.sum(-2)",
-            'nothing changes.\n    """\n    weight = active[..., None]\n'
             "    number = weight.sum(-2) * 0 + weight.shape[-2]",
         ),
         (
@@ -442,7 +440,7 @@ MUTANTS = [
         "algorithm/selection/draws.py",
         "draws selected",
         ("drawn by the left edge", 'side="right"', 'side="left"'),
-        ("last minibatch left out", "(number + full - 1) // full", "number // full"),
+        ("last minibatch left out", "(number + size - 1) // size", "number // size"),
         ("steps without a row", "jnp.minimum(number, minibatches)", "minibatches"),
     ),
     *_of(
