@@ -76,7 +76,7 @@ def test_a_curve_that_cannot_be_drawn_costs_no_training(tmp_path: Path, capsys) 
 
 def test_the_table_of_a_run_gives_the_curves_of_the_run(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    MetricsCsv(run)
+    MetricsCsv(run, print)
     for of_run, of_table in zip(read_sources([run]), read_sources([run / NAME]), strict=True):
         assert of_run.label == of_table.label and list(of_run.seeds) == list(of_table.seeds)
         for seed in of_run.seeds:
