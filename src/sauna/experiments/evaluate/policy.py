@@ -79,7 +79,8 @@ class TrainedPolicy(FrozenPolicy):
         Sampled actions follow from how many calls there were before.
 
         Args:
-          state, episode_start: of recurrent policies, which there are none of; not read.
+          state: of recurrent policies, which there are none of; not read.
+          episode_start: likewise.
 
         Returns:
           `(action, None)`.
