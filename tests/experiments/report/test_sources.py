@@ -220,3 +220,13 @@ def test_the_commands_answer_mistakes_in_one_line(tmp_path: Path) -> None:
         assert done.returncode == 2 and message in done.stderr
         assert len(done.stderr.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_an_arm_of_one_row_is_left_out_beside_one_that_has_a_curve(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    path.write_text("arm,seed,env_steps,return_mean\nppo,0,1,2\nppo,0,2,3\nsauna,0,1,2\n")
+    (found,) = read_sources([path])
+    assert found.label == "ppo" and list(found.seeds[0][1]) == [2.0, 3.0]
+    path.write_text("arm,seed,env_steps,return_mean\nppo,0,1,2\nsauna,0,1,2\n")
+    with pytest.raises(BadInput, match="no seed has two points"):
+        read_sources([path])

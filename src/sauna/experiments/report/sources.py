@@ -25,6 +25,7 @@ TAGS = (
     "Train/mean_reward",
     "eval/episode_reward",
 )
+TOO_SHORT = "no seed has two points or more"
 MAX_EVENT = 1 << 24  # bytes of an event that is read: scalars take less than a hundred
 
 
@@ -152,7 +153,10 @@ def _read_csv(path: Path) -> list[Source]:
         raise BadInput(f"{path}: cannot be read ({error})") from error
     if not points:
         raise BadInput(f"{path}: no row has a return")
-    return [Source(arm, "", "", path, {}, _curves(path, own)) for arm, own in points.items()]
+    curves = {arm: found for arm, own in points.items() if (found := _curves(own))}
+    if not curves:
+        raise BadInput(f"{path}: {TOO_SHORT}")
+    return [Source(arm, "", "", path, {}, found) for arm, found in curves.items()]
 
 
 def _column(path: Path, names: Any, known: tuple[str, ...]) -> str:
@@ -171,8 +175,8 @@ def _point(
         raise BadInput(f"{path}: row {number} has something that is no number") from None
 
 
-def _curves(path: Path, points: Mapping[int, list[tuple[float, float]]]) -> dict[int, Curve]:
-    """Curves from points in any order; several at one env step are averaged."""
+def _curves(points: Mapping[int, list[tuple[float, float]]]) -> dict[int, Curve]:
+    """Curves from points in any order, of seeds that have two; several at one step are averaged."""
     curves = {}
     for seed, found in sorted(points.items()):
         at: dict[float, list[float]] = {}
@@ -182,8 +186,6 @@ def _curves(path: Path, points: Mapping[int, list[tuple[float, float]]]) -> dict
         x = sorted(at)
         if len(x) > 1:
             curves[seed] = Curve(np.array(x), np.array([np.mean(at[step]) for step in x]))
-    if not curves:
-        raise BadInput(f"{path}: no seed has two points or more")
     return curves
 
 
@@ -211,9 +213,9 @@ def _read_events(path: Path, seeds: list[list[Path]], tag: str) -> Source:
             wanted = repr(tag) if tag else "that this program knows the returns by"
             raise BadInput(f"{path}: has no tag {wanted} (tags: {known}); give --tag")
         points[seed] = scalars[chosen]
-    return Source(
-        path.stem if path.is_file() else path.name, "", "", path, {}, _curves(path, points)
-    )
+    if not (curves := _curves(points)):
+        raise BadInput(f"{path}: {TOO_SHORT}")
+    return Source(path.stem if path.is_file() else path.name, "", "", path, {}, curves)
 
 
 def read_scalars(file: Path) -> Iterator[tuple[str, float, float]]:
