@@ -173,6 +173,10 @@ def saved_table(result: dict[str, Any]) -> str:
     for name, one in cases.items():
         lines.append(f"| {name} | {_row(one['ratio'])} |")
     lines.append(f"| bound: 1.15 k + 0.05 | {_row(bounds)} |")
+    if pong := result.get("Pong, whole training"):
+        faster, rounds = pong["faster_at_0.5"], pong["rounds"]
+        lines += ["", f"Whole Pong training at a kept share of 0.5: {faster:.2f} times as fast"]
+        lines[-1] += f" (CPU time, {rounds} rounds)."
     return "\n".join(lines)
 
 

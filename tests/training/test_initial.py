@@ -15,9 +15,9 @@ from helpers import SMALL, equal, make_job, train_here
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory
+from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
 from sauna.training.initial import Source, _reward_moments, _source_of, read_initial
-from sauna.training.loop.member_state import under
 from sauna.training.prepare import prepare
 from threads import trained_here
 

@@ -2,25 +2,24 @@
 
 A run stores both under `code["sauna"]`, as `REVISION DIGEST`. The revision is the version of the
 package, or the git revision of a checkout, which ends in `+changes` while its sources are edited.
-So a new version is told from an edit: the first is named, the second is refused.
+So a new version differs from an edit: the first is named, the second is refused.
 """
 
 from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import os
-import subprocess
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+
+from sauna.system import git
 
 KEY = "sauna"
 PACKAGE = Path(__file__).parents[1]
 # What decides a run's numbers: folders of code, and the defaults that no name of a run holds.
 COMPUTING = ("algorithm", "envs", "training/loop")
 DEFAULTS = ("config/options.py", "config/run_options.py", "config/arms.py")
-EDITED = "+changes"
 
 
 @cache
@@ -42,7 +41,7 @@ def edited_sources(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     old, new = _parts(before), _parts(now)
     if old is None or new is None or old[1] == new[1]:
         return ""
-    if old[0] != new[0] and not (old[0] + new[0]).count(EDITED):
+    if old[0] != new[0] and not (old[0] + new[0]).count(git.EDITED):
         return ""
     return f"sauna's own sources, {old[0]} -> {new[0]}, were edited"
 
@@ -74,20 +73,12 @@ def _digest(package: Path) -> str:
 def _revision(package: Path) -> str:
     """The git revision if git tracks the package's files, else the installed version."""
     try:
-        _git(package, "ls-files", "--error-unmatch", "--", "__init__.py")
-        revision = _git(package, "rev-parse", "--short=12", "HEAD")
-        edited = _git(package, "status", "--porcelain", "--", *COMPUTING, *DEFAULTS)
-    except (OSError, subprocess.SubprocessError):
+        git.ask(package, "ls-files", "--error-unmatch", "--", "__init__.py")
+        revision = git.ask(package, "rev-parse", "--short=12", "HEAD")
+        edited = git.ask(package, "status", "--porcelain", "--", *COMPUTING, *DEFAULTS)
+    except git.FAILURES:
         return _version()
-    return revision + (EDITED if edited else "")
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    """Asks git, without a lock in the way of the user's commands, or a hook's variables."""
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-    env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=5, env=env)
-    return done.stdout.strip()
+    return revision + (git.EDITED if edited else "")
 
 
 def _version() -> str:

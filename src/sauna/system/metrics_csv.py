@@ -25,6 +25,7 @@ from sauna.system.safe_write import open_grown, replacing, sync_folder
 
 NAME = "metrics.csv"
 WALL = "wall_seconds"
+LATER = "the training goes on, and the table is made anew at its end"
 _FIRST = ("member", "arm", "seed", "iteration", WALL)
 
 
@@ -41,7 +42,7 @@ class MetricsCsv:
         self._is_whole = True  # False: a row is missing, or half of one is there
         for row in _rows(run):
             self._columns |= dict.fromkeys(_cells(row))
-        self._try(self._write_anew, "the training goes on, and the table is made anew at its end")
+        self._try(self._write_anew, LATER)
 
     def append(self, rows: list[dict[str, Any]], wall_seconds: float | None) -> None:
         """Adds the rows of one iteration, which the logs have already."""
@@ -54,7 +55,7 @@ class MetricsCsv:
         is_new = bool(new) or not (self._run / NAME).exists()
         self._try(
             self._write_anew if is_new else partial(self._add, cells),
-            "the training goes on, and the table is made anew at its end",
+            LATER,
         )
 
     def finish(self) -> None:

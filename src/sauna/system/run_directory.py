@@ -24,12 +24,12 @@ import os
 import platform
 import shlex
 import shutil
-import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
+from sauna.system import git
 from sauna.system.errors import BadInput
 from sauna.system.logs import NAMES as LOGS
 from sauna.system.logs import read_rows
@@ -265,14 +265,7 @@ def machine() -> dict[str, Any]:
 def git_revision() -> str | None:
     """Of the working directory, with `+changes` where it is not clean; None outside of git."""
     try:
-        revision = _git("rev-parse", "HEAD")
-        return revision + ("+changes" if _git("status", "--porcelain") else "")
-    except (OSError, subprocess.SubprocessError):
+        revision = git.ask(".", "rev-parse", "HEAD")
+        return revision + (git.EDITED if git.ask(".", "status", "--porcelain") else "")
+    except git.FAILURES:
         return None
-
-
-def _git(*arguments: str) -> str:
-    done = subprocess.run(
-        ["git", *arguments], capture_output=True, text=True, check=True, timeout=5
-    )
-    return done.stdout.strip()

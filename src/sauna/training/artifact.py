@@ -87,9 +87,7 @@ def best_of(artifact: Artifact, member: str) -> dict[str, Any]:
     Raises:
       BadInput: it was not evaluated during training.
     """
-    prefix = f"{member}/best/"
-    arrays = artifact.checkpoint.arrays
-    found = {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
+    found = checkpoint.under(f"{member}/best/", artifact.checkpoint.arrays)
     if not found:
         raise BadInput(f"best: {member} was not evaluated during training; see --eval-every")
     return found

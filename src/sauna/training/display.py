@@ -259,9 +259,7 @@ class LiveDisplay:
         self.refresh()
         self.close()
         self.say("return: mean training return of the last 100 episodes")
-        for name, row in members.items():
-            if text := evaluated(row):
-                self.say(f"{name}{text}")
+        say_evaluations(self, members)
 
     def close(self) -> None:
         if self._live is not None:
@@ -298,9 +296,7 @@ class NotebookDisplay(PlainDisplay):
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
         if self._handle is not None:
             self._handle.update(self._html())
-        for name, row in members.items():
-            if text := evaluated(row):
-                self.say(f"{name}{text}")
+        say_evaluations(self, members)
 
     def _html(self) -> Any:
         from IPython.display import HTML
@@ -317,7 +313,7 @@ class NotebookDisplay(PlainDisplay):
         )
 
 
-def evaluated(row: dict[str, Any]) -> str:
+def evaluated(row: Mapping[str, Any]) -> str:
     """Says what a member's evaluations came to, and whether it was stopped early."""
     text = ""
     if "eval_return_mean" in row:
@@ -328,6 +324,13 @@ def evaluated(row: dict[str, Any]) -> str:
     if "stopped_early" in row:
         text += f"; stopped early ({row['stopped_early']})"
     return text
+
+
+def say_evaluations(display: Display, members: Mapping[str, Mapping[str, Any]]) -> None:
+    """Says a line for each member that was evaluated or stopped early."""
+    for name, row in members.items():
+        if text := evaluated(row):
+            display.say(f"{name}{text}")
 
 
 def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str, str, str]]:

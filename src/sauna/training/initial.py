@@ -131,9 +131,7 @@ def _source_of(member: Member, known: list[str], named: str) -> str:
 
 def _arrays_of(artifact: Artifact, name: str, best: bool, normalizer: str) -> dict[str, np.ndarray]:
     """A member's parameters, and as much of its running statistics as is kept."""
-    prefix = f"{name}/"
-    stored = artifact.checkpoint.arrays
-    own = {key[len(prefix) :]: a for key, a in stored.items() if key.startswith(prefix)}
+    own = checkpoint.under(f"{name}/", artifact.checkpoint.arrays)
     policy = best_of(artifact, name) if best else own
     found = {key: a for key, a in policy.items() if key.startswith("params/")}
     if normalizer != "fresh":

@@ -14,9 +14,9 @@ from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
-from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.training.artifact import Artifact, best_of, check_spaces, find_member
-from sauna.training.loop.member_state import fitting, flat_params, under
+from sauna.training.loop.member_state import fitting, flat_params
 
 CHUNK = 512  # observations of one call of `heads`: one compiled shape, and bounded memory
 

@@ -23,10 +23,10 @@ from sauna.experiments.inspect.learned import Learned, learned, reads_rollouts
 from sauna.experiments.inspect.recording import Played, open_env, play_episodes
 from sauna.experiments.inspect.streams import more_plays, scaled, stacked, stream_of
 from sauna.system import run_directory
-from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.training.artifact import Artifact
 from sauna.training.loop.budget import hypers_now
-from sauna.training.loop.member_state import Counters, under, unpack_optimizer, unpack_sampler
+from sauna.training.loop.member_state import Counters, unpack_learner
 
 LARGEST = 10_000_000  # numbers in the matrix whose principal components are computed
 
@@ -132,7 +132,7 @@ def member_state(
 ) -> TrainState:
     """A member's learning state as its checkpoint has it."""
     example = make_learner(config, policy.policy, artifact.spaces).init(jax.random.key(0))
-    return TrainState(policy.params, unpack_optimizer(own, example), unpack_sampler(own, example))
+    return unpack_learner(policy.policy, own, example)
 
 
 def hypers_of(

@@ -124,12 +124,12 @@ def _other_notes(found: Inspection) -> list[str]:
     ]
     if not said:
         return []
-    told = f"No subset is taken by: {'; '.join(said)}."
+    note = f"No subset is taken by: {'; '.join(said)}."
     if found.learned is None and config.filter == "none":
-        told += " Every step is learned from."
+        note += " Every step is learned from."
     if config.critic == "avec":
-        told += " AVEC's constant, which training adds to V, is left out here."
-    return [told]
+        note += " AVEC's constant, which training adds to V, is left out here."
+    return [note]
 
 
 def _value(config: Config, name: str) -> str:

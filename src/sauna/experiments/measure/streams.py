@@ -29,9 +29,9 @@ from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
 from sauna.system import run_directory
-from sauna.system.checkpoint import BadCheckpoint, load_checkpoint
+from sauna.system.checkpoint import BadCheckpoint, load_checkpoint, under
 from sauna.training.loop.budget import hypers_now
-from sauna.training.loop.member_state import Counters, fitting, flat_params, moments_of, under
+from sauna.training.loop.member_state import Counters, fitting, flat_params, moments_of
 
 WARM_UP = 2048  # env steps at most that are thrown away, so that no stream begins with a reset
 FRESH = 0x5A07A  # sets the seeds of streams apart from those of training

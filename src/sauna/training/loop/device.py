@@ -27,6 +27,7 @@ from sauna.config.settings import Config, fields_with, to_json
 from sauna.envs.device.contract import flat
 from sauna.envs.device.make import make_jax_env
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
+from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
 from sauna.system.run_directory import versions
 from sauna.training.loop.budget import budget_left
@@ -49,7 +50,6 @@ from sauna.training.loop.member_state import (
     Counters,
     fitting,
     named_learner,
-    under,
     unpack_learner,
 )
 from sauna.training.loop.metrics import metrics_row

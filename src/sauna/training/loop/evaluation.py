@@ -29,9 +29,10 @@ from sauna.envs.host.answers import close
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.make import make_env
+from sauna.system.checkpoint import under
 from sauna.system.errors import one_line
 from sauna.training.loop.job import Arrays, Job
-from sauna.training.loop.member_state import Counters, fitting, named_params, under
+from sauna.training.loop.member_state import Counters, fitting, named_params
 from sauna.training.summary import STOPS
 
 ENV_INDEX = 2**31  # of an evaluation's episodes: no environment of training has it

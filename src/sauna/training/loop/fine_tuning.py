@@ -10,9 +10,9 @@ import numpy as np
 
 from sauna.algorithm.policy.normalize import LongMoments, Moments
 from sauna.algorithm.policy.policy import Policy
-from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.system.errors import BadInput
-from sauna.training.loop.member_state import fitting, flat_params, named_params, under
+from sauna.training.loop.member_state import fitting, flat_params, named_params
 
 FRESH = "auxiliary_head/"  # the one part of a network that an arm may have and another not
 

@@ -25,6 +25,7 @@ from sauna.config.presets import Member
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
+from sauna.system.checkpoint import under
 from sauna.training.loop.budget import budget_left, hypers_now, step_limit
 from sauna.training.loop.evaluation import Evaluator, Frozen, HostPlayer, stop_named
 from sauna.training.loop.fine_tuning import initial_moments, initial_params
@@ -33,7 +34,6 @@ from sauna.training.loop.member_state import (
     Counters,
     moments_of,
     pack_member,
-    under,
     unpack_member,
 )
 from sauna.training.loop.metrics import metrics_row

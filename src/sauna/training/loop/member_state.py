@@ -23,7 +23,7 @@ from sauna.algorithm.rollout.collected import Collected
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.types import TrainState
 from sauna.envs.host.contract import HostEnvs
-from sauna.system.checkpoint import BadCheckpoint
+from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.system.errors import SaunaError
 
 WINDOW = 100  # episodes that the reported mean return covers, as in baselines and the paper
@@ -260,11 +260,6 @@ def moments_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
 def collected_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
     """Views of what member `p` carries from one rollout to the next, by their names."""
     return {f"collect/{key}": value[p] for key, value in collector.state._asdict().items()}
-
-
-def under(prefix: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays whose names start with `prefix`, without it."""
-    return {key[len(prefix) :]: a for key, a in arrays.items() if key.startswith(prefix)}
 
 
 def _check_replayed(name: str, n: int, stored: np.ndarray, seen: np.ndarray) -> None:

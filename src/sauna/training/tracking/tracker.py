@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 
 class TrackedRun(NamedTuple):
-    """What a tracker is told of a run.
+    """What a tracker gets to know of a run.
 
     Attributes:
       path: the run directory, absolute.
