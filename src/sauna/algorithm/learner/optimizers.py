@@ -120,5 +120,5 @@ def moved_rate(rate: Array, kl: Array, config: Config) -> Array:
     """
     lower = jnp.maximum(rate / FACTOR, config.learning_rate_min)
     higher = jnp.minimum(rate * FACTOR, config.learning_rate_max)
-    held = jnp.where(kl < 0.5 * config.desired_kl, higher, rate)
-    return jnp.where(kl > 2.0 * config.desired_kl, lower, held)
+    raised = jnp.where(kl < 0.5 * config.desired_kl, higher, rate)
+    return jnp.where(kl > 2.0 * config.desired_kl, lower, raised)
