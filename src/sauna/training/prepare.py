@@ -132,6 +132,7 @@ def examine(run: RunConfig, overrides: Mapping[str, Any], found: Probe | None = 
     """
     found = found or look_at(run.config)
     run = _settle(run, found.spaces)
+    _check_together(run, found.group)
     parsed = parse_all(overrides)
     check_read_here(run.config, found.spaces, parsed)
     check_read(list(run.arms.values()), parsed)
@@ -192,6 +193,26 @@ def check_own_parts(prepared: Prepared) -> None:
         from sauna.training.check_plugins import check_plugins
 
         check_plugins(prepared.config, prepared.spaces)
+
+
+def _check_together(run: RunConfig, group: int | None) -> None:
+    """Refuses what rows that act together cannot do.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    config = run.config
+    if group is None:
+        return
+    if config.env_processes:
+        raise BadInput(f"env_processes: not read by {config.env}, which steps its rows by itself")
+    if config.filter != "none" and config.dropped == "replace":
+        raise BadInput(
+            f"dropped: the rows of {config.env} act together, so that no env can replace a step; "
+            "give mask (--dropped mask)"
+        )
+    if group and config.envs % group:
+        raise BadInput(f"envs: {config.envs} is no multiple of the {group} agents of {config.env}")
 
 
 def _network(config: Config, spaces: Spaces) -> str:
