@@ -63,7 +63,8 @@ class GroupedEnvs(HostEnvs):
         self._observation, self._final = np.zeros(shape, dtype), np.zeros(shape, dtype)
         self._reward = np.zeros(number)
         self._terminated, self._truncated, self._life_lost = np.zeros((3, number), bool)
-        self.waiting = np.zeros(number, bool)
+        self._waiting = np.zeros(number, bool)
+        self.waiting = self._waiting  # the same array, which is never None here
         self._info: dict[int, dict[str, float]] = {}
 
     def _begin(self, group: Group) -> None:

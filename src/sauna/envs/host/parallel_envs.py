@@ -77,11 +77,11 @@ class ParallelEnvs(GroupedEnvs):
 
     def _note_who_is_there(self, group: Group) -> None:
         there = set(group.env.agents)
-        self.waiting[group.rows] = [agent not in there for agent in self._agents]
+        self._waiting[group.rows] = [agent not in there for agent in self._agents]
 
     def _step_group(self, group: Group, action: np.ndarray) -> None:
         group.actions.append(action.copy())
-        waiting = self.waiting[group.rows]
+        waiting = self._waiting[group.rows]
         taken = {
             agent: self._write(action[n]) for n, agent in enumerate(self._agents) if not waiting[n]
         }

@@ -49,7 +49,7 @@ def maker_of(env: str) -> Make:
         return make_envpool(name)
     path = f"pettingzoo.{name.replace('/', '.')}"
     try:
-        return importlib.import_module(path).parallel_env  # type: ignore[no-any-return]
+        return importlib.import_module(path).parallel_env
     except (ImportError, AttributeError) as error:
         raise BadInput(
             f"env: {env} is no parallel environment of PettingZoo: {error}; write "

@@ -74,7 +74,7 @@ class VectorEnvs(GroupedEnvs):
         group.episode += 1
         seed = episode_seed(*group.seeds, group.episode)
         self._put_batch(self._observation, group, first_of(group.env.reset(seed=seed)))
-        self.waiting[group.rows] = False
+        self._waiting[group.rows] = False
 
     def _put_batch(
         self, rows: np.ndarray, group: Group, batch: Any, only: np.ndarray | None = None
@@ -89,7 +89,7 @@ class VectorEnvs(GroupedEnvs):
     def _step_group(self, group: Group, action: np.ndarray) -> None:
         batch = batch_of(group.env.single_action_space, [self._write(one) for one in action])
         observation, reward, terminated, truncated, info = five_of(group.env.step(batch))
-        rows, idle = group.rows, self.waiting[group.rows]
+        rows, idle = group.rows, self._waiting[group.rows]
         terminated, truncated = (np.asarray(end, bool) for end in (terminated, truncated))
         self._reward[rows] = np.where(idle, 0.0, np.asarray(reward, np.float64))
         self._terminated[rows] = terminated & ~idle
@@ -98,7 +98,7 @@ class VectorEnvs(GroupedEnvs):
         self._put_batch(self._observation, group, observation)
         if ended.any():
             self._end(group, ended, observation, info)
-        self.waiting[rows] = ended & (self._mode == "NEXT_STEP")
+        self._waiting[rows] = ended & (self._mode == "NEXT_STEP")
 
     def _end(self, group: Group, ended: np.ndarray, observation: Any, info: Any) -> None:
         """Writes what ended episodes had reached, and begins the next ones if that is due."""
