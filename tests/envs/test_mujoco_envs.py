@@ -42,7 +42,7 @@ def test_these_are_the_eleven_tasks() -> None:
 
 
 def assert_equals_gymnasium(name: str, kwargs: dict, steps: int) -> int:
-    """Plays both, in which some rows stand still for a while, and returns how many episodes ended."""
+    """Plays both, with rows that stand still for a while; returns how many episodes ended."""
     fast = in_process_envs(name, kwargs, SEEDS, "auto")
     plain = in_process_envs(name, kwargs, SEEDS, "gymnasium")
     assert type(fast) is MujocoEnvs and type(plain) is GymnasiumEnvs
