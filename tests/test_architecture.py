@@ -59,6 +59,7 @@ FLOORS = (
     "experiments.inspect",
     "experiments.bench",
     "experiments.study",
+    "experiments.tune",
     "experiments",
     "api",
     "cli",

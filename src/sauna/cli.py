@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | plot | runs | study | ...`.
+"""The command line: `sauna train | resume | eval | inspect | compare | tune | plot | runs | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -28,6 +28,7 @@ from sauna.config.presets import (
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.evaluate import MAX_STEPS
+from sauna.experiments.tune.flags import add_tune
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
@@ -148,6 +149,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
         place = command.add_argument_group("where it trains")
         for name, how in _PLACE.items():
             place.add_argument(flag(name), **how)
+
+    add_tune(commands, values, _PLACE)
 
     text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
     plot = commands.add_parser("plot", help=text, allow_abbrev=False)
@@ -355,6 +358,12 @@ def _compare(values: dict[str, Any]) -> None:
     _run_study(spec, compare_command(env, arms, values, place["out"], rules, controls), **place)
 
 
+def _tune(values: dict[str, Any]) -> None:
+    from sauna.experiments.tune.flags import tune_from_flags
+
+    tune_from_flags(values, _say)
+
+
 def _plot(values: dict[str, Any]) -> None:
     from sauna.experiments.report.curve import plot
 
@@ -412,6 +421,7 @@ _COMMANDS = {
     "eval": _eval,
     "inspect": _inspect,
     "compare": _compare,
+    "tune": _tune,
     "plot": _plot,
     "runs": _runs,
     "study": _study,
