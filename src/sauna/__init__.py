@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
+    from sauna.experiments.record import record
     from sauna.system.errors import BadInput, SaunaError
     from sauna.training.tracking.tracker import TrackedRun, Tracker
 
@@ -52,6 +53,7 @@ __all__ = [
     "evaluate",
     "inspect",
     "load",
+    "record",
     "resume",
     "train",
 ]
@@ -70,6 +72,7 @@ _HOMES = {
     "Tracker": "sauna.training.tracking.tracker",
     "evaluate": "sauna.experiments.evaluate.episodes",
     "inspect": "sauna.experiments.inspect.command",
+    "record": "sauna.experiments.record",
     **dict.fromkeys(
         (
             "Choice",
