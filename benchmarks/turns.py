@@ -35,6 +35,9 @@ class Turns:
             self.began = time.process_time()
         return self.block - iteration % self.block
 
+    def stopped(self) -> set[str]:
+        return set()
+
     def iteration(self, iteration: int, rows: list[Any], timing: Any) -> None:
         pass
 

@@ -30,7 +30,6 @@ _MINIGRID = {
 _BIPEDAL = {**_NORMALIZED, "rollout_steps": 2048, "epochs": 10}
 
 TASK_PRESETS: dict[str, dict[str, Any]] = {
-    # Its clip range falls to 0 with the step size; here it stays.
     "cartpole": {
         **_SB3,
         "envs": 8,
@@ -39,6 +38,7 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
         "epochs": 20,
         "learning_rate": 1e-3,
         "learning_rate_schedule": "linear",
+        "clip_range_schedule": "linear",
         "gamma": 0.98,
         "gae_lambda": 0.8,
     },
@@ -94,13 +94,13 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
         "gamma": 0.999,
         "clip_range": 0.18,
     },
-    # Its clip range falls to 0 with the step size; here it stays.
     "bipedal-walker-hardcore": {
         **_BIPEDAL,
         "envs": 16,
         "minibatches": 512,
         "learning_rate": 2.5e-4,
         "learning_rate_schedule": "linear",
+        "clip_range_schedule": "linear",
         "entropy_coef": 0.001,
     },
     # RL Zoo repeats each action twice, and learns from two grey pictures of 64 x 64 pixels by GELU
