@@ -26,7 +26,7 @@ from sauna.training.artifact import Artifact
 
 ROOT = Path(__file__).parent.parent
 RUNS, FILE = ROOT / "runs" / "clone", ROOT / "results" / "clone.json"
-SEEDS, EPISODES = 3, 20
+SEEDS, EPISODES = 3, 10
 # Task: env steps of the expert, episodes recorded, env steps from there and from scratch.
 TASKS = {"CartPole-v1": (60_000, 20, 20_000), "Hopper-v5": (500_000, 50, 100_000)}
 

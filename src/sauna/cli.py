@@ -338,6 +338,7 @@ def _set_up_playing(values: dict[str, Any]) -> None:
     values |= {name: whole_number(values, name, number) for name, number in least.items()}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
+    os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "0")  # a step waits for each action
 
 
 def _inspect(values: dict[str, Any]) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -71,11 +72,12 @@ def clone_members(
     arrays: dict[str, np.ndarray] = {}
     figures: dict[str, Any] = {}
     made: dict[Any, Any] = {}
+    cloner_of = cache(lambda value_coef: make_cloner(config, policy, value_coef))  # compiled once
     for member in prepared.members:
         key = (member.seed, *(getattr(member.config, field) for field in READ))
         if key not in made:
             split = _split(data, member.config, moments)
-            made[key] = *_clone(member, policy, make_cloner(member.config, policy), split), split
+            made[key] = *_clone(member, policy, cloner_of(member.config.value_coef), split), split
         params, found, split = made[key]
         own = {**params, **_statistics(config, moments, split.rewards)}
         arrays |= {f"{member.name}/{part}": array for part, array in own.items()}
@@ -235,5 +237,5 @@ def _line(member: str, name: str, data: Demonstrations, found: dict[str, Any]) -
         f"epoch {found['epoch']} of {found['epochs']}, loss {found['loss']:.4f}; on "
         f"{found['held_out_episodes']} held-out episodes ({found['held_out_steps']:,} env steps): "
         f"log-likelihood {held['log_likelihood']:.3f} (before: {before['log_likelihood']:.3f}), "
-        f"{what} {held['agreement']:.1%}, of returns {held['value_explained']:.1%}"
+        f"{what} {held['agreement']:.1%}, values off by {held['value_error']:.1%}"
     )

@@ -1,7 +1,8 @@
 """Behaviour cloning: a policy of largest likelihood, and the values of what was played.
 
-The loss of `B` rows is `-mean(log pi(a|s)) + c1 mean((V(s) - G)^2)`, with `c1` the weight of PPO's
-value loss, and its optimizer is Adam (Pomerleau 1991; the policy term is that of the package
+The loss of `B` rows is `-mean(log pi(a|s)) + c1 mean((V(s) - G)^2) / mean(G^2)`, with `c1` the
+weight of PPO's value loss and the last mean over all rows, so that no scale of rewards lets one
+term drown the other. Its optimizer is Adam (Pomerleau 1991; the policy term is that of the package
 `imitation`). `G` is the discounted sum of the rewards up to the end of the episode. Behind an end
 that is no termination, the value goes on: `gamma^k V(s_end)` of today's network is added, where `k`
 env steps are left.
@@ -43,7 +44,7 @@ class Fit(NamedTuple):
     loss: Array
     log_likelihood: Array  # mean log-probability of the actions
     agreement: Array  # share of rows whose mode is the action; continuous: explained variance
-    value_explained: Array  # explained variance of G
+    value_error: Array  # root of mean((V - G)^2) / mean(G^2)
 
 
 class State(NamedTuple):
@@ -65,10 +66,10 @@ class Cloner(NamedTuple):
     fit: Callable[[Array, Rows], Fit]
 
 
-def make_cloner(config: Config, policy: Policy) -> Cloner:
+def make_cloner(config: Config, policy: Policy, value_coef: float) -> Cloner:
     """Builds (without compiling) what a policy is cloned by."""
     optimizer = optax.adam(config.clone_learning_rate)
-    how: dict[str, Any] = {"policy": policy, "value_coef": config.value_coef}
+    how: dict[str, Any] = {"policy": policy, "value_coef": value_coef}
     return Cloner(
         lambda params: State(params, optimizer.init(params)),
         jax.jit(partial(_epoch, optimizer=optimizer, **how)),
@@ -82,8 +83,10 @@ def _targets(params: Array, rows: Rows, policy: Policy) -> Array:
     return rows.return_ + rows.discount * values[rows.episode]
 
 
-def _losses(log_prob: Array, value: Array, target: Array, value_coef: float) -> Array:
-    return -jnp.mean(log_prob) + value_coef * jnp.mean((value - target) ** 2)
+def _scale(target: Array) -> Array:
+    """`mean(G^2)`; 1 if no reward was ever given."""
+    square = jnp.mean(target**2)
+    return jnp.where(square > 0, square, 1.0)
 
 
 def _epoch(
@@ -96,11 +99,13 @@ def _epoch(
     value_coef: float,
 ) -> tuple[State, Array]:
     target = _targets(state.params, rows, policy)
+    scale = _scale(target)
 
     def loss(params: Array, chosen: Array) -> Array:
         output = policy.apply(params, rows.observation[chosen])
         log_prob = policy.distribution.log_prob(output.policy, rows.action[chosen])
-        return _losses(log_prob, output.value, target[chosen], value_coef)
+        error = jnp.mean((output.value - target[chosen]) ** 2) / scale
+        return value_coef * error - jnp.mean(log_prob)
 
     def step(state: State, chosen: Array) -> tuple[State, Array]:
         now, gradient = jax.value_and_grad(loss)(state.params, chosen)
@@ -125,12 +130,9 @@ def _fit(params: Array, rows: Rows, *, policy: Policy, value_coef: float) -> Fit
         agreement = jnp.mean(jnp.all(mode == rows.action, -1))
     else:
         agreement = _explained(rows.action, mode)
-    return Fit(
-        _losses(log_prob, value, target, value_coef),
-        jnp.mean(log_prob),
-        agreement,
-        _explained(target[:, None], value[:, None]),
-    )
+    error = jnp.mean((value - target) ** 2) / _scale(target)
+    likelihood = jnp.mean(log_prob)
+    return Fit(value_coef * error - likelihood, likelihood, agreement, jnp.sqrt(error))
 
 
 def _explained(true: Array, guess: Array) -> Array:
