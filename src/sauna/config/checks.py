@@ -156,6 +156,8 @@ def check_rules(config: Config) -> None:
             if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
                 raise BadInput(f"{name}: needs gae_over=all")
     check_passes(config)
+    if config.replay_rollouts:
+        check_replay(config)
     if config.normalize_over == "kept" and config.sampler == "none":
         raise BadInput("normalize_over: kept needs a sampler; without one it is rollout")
     if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
@@ -163,6 +165,22 @@ def check_rules(config: Config) -> None:
             "objective: unclipped needs a stop rule (espo) or a loss_weight "
             "(sample-dropout): nothing else bounds the ratio"
         )
+
+
+def check_replay(config: Config) -> None:
+    """Refuses what cannot learn from earlier rollouts.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    plain = {"gae_over": "all", "critic": "squared", "recompute_advantages": False}
+    for name, value in plain.items():
+        if getattr(config, name) != value:
+            raise BadInput(f"replay_rollouts: not read with {name} {getattr(config, name)}")
+    if config.sampler == "pods":
+        raise BadInput("replay_rollouts: pods takes segments of one rollout")
+    if config.filter != "none" and config.control != "none":
+        raise BadInput("replay_rollouts: not read with the control of a filter")
 
 
 def check_passes(config: Config) -> None:
