@@ -96,12 +96,16 @@ def sampled(space: Any, number: int) -> list[Any]:
     return [space.sample() for _ in range(number)]
 
 
+DEFAULT = [kind for kind in KINDS if kind != "last channel, box"]
+EVERY = [*DEFAULT, pytest.param("last channel, box", marks=pytest.mark.slow)]  # it compiles long
+
+
 def number_of(kind: str) -> int:
     """Of observations; pictures are many numbers each."""
     return 30 if "nature-cnn" in KINDS[kind][2].values() else MANY
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY)
 def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
     policy, graph, space = policy_of(kind)
     act, seen = numpy_file(graph, tmp_path), sampled(space, number_of(kind))
