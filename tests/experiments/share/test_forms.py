@@ -151,7 +151,7 @@ def test_a_title_of_somebody_elses_ends_no_text(tmp_path: Path) -> None:
 
 def test_a_network_of_ones_own_is_refused() -> None:
     config = dataclasses.replace(configured(), network="own_networks:Net")
-    with pytest.raises(BadInput, match="only mlp and nature-cnn"):
+    with pytest.raises(BadInput, match="network own_networks:Net; only mlp and nature-cnn are"):
         policy_graph(config, {}, BOX, gym.Discrete(2))
 
 

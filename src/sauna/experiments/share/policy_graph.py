@@ -19,6 +19,8 @@ from sauna.experiments.share.graph import Graph
 from sauna.system.errors import BadInput
 
 Arrays = Mapping[str, np.ndarray]
+NETWORKS = ("mlp", "nature-cnn")
+ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu"}
 
 
 def policy_graph(
@@ -33,9 +35,8 @@ def policy_graph(
     Raises:
       BadInput: the policy is of a kind that cannot be exported.
     """
-    if config.network not in ("mlp", "nature-cnn"):
-        raise BadInput(f"export: network {config.network} is your own; only mlp and nature-cnn can")
     graph, spaces = Graph(), describe(observation_space, action_space)
+    _check(config, spaces)
     if spaces.observation_kind == "image":
         seen = _image(graph, config, spaces, observation_space)
     elif config.normalize_observations:
@@ -51,6 +52,25 @@ def policy_graph(
     parameters = _dense(graph, arrays, features, "policy_head")
     _action(graph, spaces, action_space, parameters, config.rescale_actions)
     return graph
+
+
+def _check(config: Config, spaces: Spaces) -> None:
+    """Refuses what is not written here.
+
+    Raises:
+      BadInput: naming it.
+    """
+    unknown = ""
+    if config.network not in NETWORKS:
+        unknown = f"network {config.network}; only {' and '.join(NETWORKS)} are"
+    elif config.network == "mlp" and config.activation not in ACTIVATIONS:
+        unknown = f"activation {config.activation}"
+    elif config.network == "mlp" and config.layer_norm:
+        unknown = "layer_norm"
+    elif spaces.observation_kind not in ("vector", "one_hot", "image"):
+        unknown = f"observations of kind {spaces.observation_kind}"
+    if unknown:
+        raise BadInput(f"export: not written as ONNX or numpy: {unknown}")
 
 
 def _vector(graph: Graph, space: Any, dtype: str) -> str:
@@ -149,9 +169,10 @@ def _dense(graph: Graph, arrays: Arrays, x: str, name: str) -> str:
 
 
 def _mlp(graph: Graph, arrays: Arrays, x: str, trunk: str, config: Config) -> str:
-    activation = {"tanh": "Tanh", "relu": "Relu"}[config.activation]
     for i in range(len(config.hidden)):
-        x = graph.add(activation, _dense(graph, arrays, x, f"{trunk}/layer_{i}"))
+        x = graph.add(
+            ACTIVATIONS[config.activation], _dense(graph, arrays, x, f"{trunk}/layer_{i}")
+        )
     return x
 
 
