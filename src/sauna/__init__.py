@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
     from sauna.experiments.record import record
+    from sauna.experiments.share.export import export
     from sauna.system.errors import BadInput, SaunaError
     from sauna.training.tracking.tracker import TrackedRun, Tracker
 
@@ -51,6 +52,7 @@ __all__ = [
     "VexTarget",
     "compare",
     "evaluate",
+    "export",
     "inspect",
     "load",
     "record",
@@ -71,6 +73,7 @@ _HOMES = {
     "TrackedRun": "sauna.training.tracking.tracker",
     "Tracker": "sauna.training.tracking.tracker",
     "evaluate": "sauna.experiments.evaluate.episodes",
+    "export": "sauna.experiments.share.export",
     "inspect": "sauna.experiments.inspect.command",
     "record": "sauna.experiments.record",
     **dict.fromkeys(
