@@ -28,8 +28,8 @@ from sauna.config.presets import (
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.evaluate import MAX_STEPS
-from sauna.experiments.tune.flags import add_tune
 from sauna.experiments.share import flags as sharing
+from sauna.experiments.tune.flags import add_tune, tune_from_flags
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
@@ -378,12 +378,6 @@ def _compare(values: dict[str, Any]) -> None:
     _run_study(spec, compare_command(env, arms, values, place["out"], rules, controls), **place)
 
 
-def _tune(values: dict[str, Any]) -> None:
-    from sauna.experiments.tune.flags import tune_from_flags
-
-    tune_from_flags(values, _say)
-
-
 def _plot(values: dict[str, Any]) -> None:
     from sauna.experiments.report.curve import plot
 
@@ -442,7 +436,7 @@ _COMMANDS = {
     "record": _record,
     "inspect": _inspect,
     "compare": _compare,
-    "tune": _tune,
+    "tune": lambda values: tune_from_flags(values, _say),
     "plot": _plot,
     "runs": _runs,
     "study": _study,
