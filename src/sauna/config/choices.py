@@ -15,6 +15,8 @@ SAMPLERS = (
     "vex-oracle",
 )
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
+DISTRIBUTIONS = ("gaussian", "squashed", "beta", "gsde")
+BOUNDED = ("squashed", "beta")  # actions inside the bounds of their box by themselves
 NETWORKS = ("auto", "mlp", "nature-cnn")
 OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
 SCHEDULES = ("constant", "linear", "cosine")

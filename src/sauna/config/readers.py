@@ -5,6 +5,8 @@ Of a `Config`, or of an environment's `Spaces` for `needs_spaces`; see `fields.o
 
 from __future__ import annotations
 
+from sauna.config.choices import BOUNDED
+
 ON_HOST = ("environments on the host", lambda c: c.backend != "device")
 WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
 TRACKED = ("track", lambda c: c.track != ("none",))
@@ -19,6 +21,12 @@ NO_KL_RATE = (
 ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
+LOG_STD = ("a distribution other than beta", lambda c: c.distribution != "beta")
+GSDE = ("distribution gsde", lambda c: c.distribution == "gsde")
+UNBOUNDED = (
+    "distribution gaussian or gsde: the others are stretched to the bounds by themselves",
+    lambda c: c.distribution not in BOUNDED,
+)
 VECTORS = (
     "vector observations: others have no running moments",
     lambda spaces: spaces.observation_kind == "vector",

@@ -27,6 +27,8 @@ SHAPES = (
     "hidden",
     "activation",
     "trunk",
+    "distribution",
+    "sde_expln",
     "rescale_actions",
     "normalize_observations",
 )

@@ -84,6 +84,7 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
         config.steps // rows,
         action_kind,
         action_sizes,
+        config.distribution,
     )
     sampler = _made("sampler", config.sampler, SAMPLERS, Sampler, config.sampler_kwargs, setup)
     weight = _made(
@@ -94,6 +95,12 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
             raise BadInput(f"control: stride takes at most {MAX_STRIDE_ROWS} rows, not {rows}")
         sampler = sampler and controlled(config.control, sampler)
         weight = weight and controlled_weight(config.control, weight)
+    beta = action_kind == "continuous" and config.distribution == "beta"
+    if weight is not None and weight.on_mean and beta:
+        raise BadInput(
+            "loss_weight: its on_mean needs a parameter of the mean, which distribution beta has "
+            "none of"
+        )
     return Rules(
         sampler=sampler,
         loss_weight=weight,
