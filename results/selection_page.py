@@ -17,7 +17,9 @@ from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.tables import unversioned
 
 PILOTS = ("selection-pilot-hopper", "selection-pilot-breakout")
-SCREENS = ("selection-screen-mujoco", "selection-screen-minatar", "selection-screen-classic")
+SCREENS = tuple(
+    f"selection-screen-{name}" for name in ("mujoco", "minatar", "cartpole", "lunarlander")
+)
 SELECTION = (*PILOTS, *SCREENS)
 # Quantities of a curve that are committed, and points of it: there are many arms.
 CURVES = ("return_mean", "samples_backward", "learner_cpu_seconds")

@@ -1,11 +1,12 @@
 """Do six short runs still end with the same bytes? Trains them and compares with `six_runs.json`.
 
     python tests/six_runs.py           compare; exit 1 where a digest differs
-    python tests/six_runs.py --write   write the digests of this code on this machine
+    python tests/six_runs.py --write   write the digests of this code on this kind of processor
 
 The runs cover PPO, every SAUNA arm, A2C, the device backend and Atari. A digest covers the newest
 checkpoint's arrays (parameters, optimizer, normalizer, environments, counters) by name and bytes.
-Bits depend on the processor and on the versions of JAX and MuJoCo, so the file names both.
+Bits depend on the processor and on the versions of JAX and MuJoCo, so the file names both. Of a
+processor that it does not know, write those of an earlier revision first.
 """
 
 from __future__ import annotations
@@ -61,15 +62,18 @@ def processor() -> str:
 
 
 def main() -> None:
+    here, stored = processor(), json.loads(STORED.read_text())
+    if "--write" not in sys.argv and here not in stored:
+        sys.exit(f"no digests of {here} in {STORED.name}; write those of an earlier revision")
     digests = train_all()
     if "--write" in sys.argv:
         versions = {name: version(name) for name in ("jax", "mujoco", "numpy", "gymnasium")}
-        stored = {"processor": processor(), "versions": versions, "digests": digests}
+        stored[here] = {"versions": versions, "digests": digests}
         STORED.write_text(json.dumps(stored, indent=1) + "\n")
         return
-    stored = json.loads(STORED.read_text())
-    differing = [name for name in RUNS if digests[name] != stored["digests"][name]]
-    print(f"{len(RUNS) - len(differing)} of {len(RUNS)} the same as on {stored['processor']}")
+    known = stored[here]["digests"]
+    differing = [name for name in RUNS if digests[name] != known[name]]
+    print(f"{len(RUNS) - len(differing)} of {len(RUNS)} the same as stored, on {here}")
     sys.exit(bool(differing))
 
 

@@ -64,6 +64,7 @@ class Batch(NamedTuple):
     vex: Any = None  # [T * N] the Vex head at collection, for rules of selection
     next_observation: Any = None  # [T * N, ...] for the auxiliary head
     next_weight: Any = None  # [T * N] 1, or 0 if the next observation is not of this episode
+    importance: Any = None  # [T * N] multiplies the policy term of a replayed step; None: 1
 
 
 class TrainState(NamedTuple):
@@ -73,6 +74,14 @@ class TrainState(NamedTuple):
     optimizer: Any  # optax's: ScaleByAdamState (count int32, mu [D], nu [D]), or another
     sampler: Any = ()  # what a selection rule carries from one iteration to the next
     learning_rate: Any = ()  # [] of the last step, 0 before the first; () unless the KL moves it
+    replay: Any = ()  # a `Replay`; () if the update learns from the new rollout alone
+
+
+class Replay(NamedTuple):
+    """The latest rollouts of a member, newest first."""
+
+    rollouts: Rollout  # [R, S, N, ...]
+    number: Array  # [] int32, how many there are so far; the others are empty
 
 
 class PolicyOutput(NamedTuple):
@@ -149,12 +158,13 @@ class SamplerSetup(NamedTuple):
     iterations: int  # of the whole budget, if no filter drops anything
     action_kind: str
     action_sizes: tuple[int, ...]
+    replay_rollouts: int = 0
     distribution: str = "gaussian"  # of continuous actions
 
     @property
     def rows(self) -> int:
-        """M = T * N."""
-        return self.rollout_steps * self.envs
+        """M = T * N, and as many again for each rollout that is replayed."""
+        return self.rollout_steps * self.envs * (1 + self.replay_rollouts)
 
 
 class Samples(NamedTuple):

@@ -158,6 +158,8 @@ def check_rules(config: Config) -> None:
                 raise BadInput(f"{name}: needs gae_over=all")
     check_passes(config)
     check_distribution(config)
+    if config.replay_rollouts:
+        check_replay(config)
     if config.normalize_over == "kept" and config.sampler == "none":
         raise BadInput("normalize_over: kept needs a sampler; without one it is rollout")
     if config.objective == "unclipped" and config.stop == "none" and config.loss_weight == "none":
@@ -184,6 +186,22 @@ def check_distribution(config: Config) -> None:
             "loss_weight: delight weighs the gradient of the mean, which distribution beta has "
             'no parameter for; loss_weight_kwargs {"on": "all"} weighs it whole'
         )
+
+
+def check_replay(config: Config) -> None:
+    """Refuses what cannot learn from earlier rollouts.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    plain = {"gae_over": "all", "critic": "squared", "recompute_advantages": False}
+    for name, value in plain.items():
+        if getattr(config, name) != value:
+            raise BadInput(f"replay_rollouts: not read with {name} {getattr(config, name)}")
+    if config.sampler == "pods":
+        raise BadInput("replay_rollouts: pods takes segments of one rollout")
+    if config.filter != "none" and config.control != "none":
+        raise BadInput("replay_rollouts: not read with the control of a filter")
 
 
 def check_passes(config: Config) -> None:

@@ -283,6 +283,12 @@ class Config(RunOptions):
     recompute_advantages: bool = _update(
         False, "compute values and advantages anew before each epoch", read_when=readers.PPO
     )
+    replay_rollouts: int = _update(
+        0,
+        "earlier rollouts that the update learns from again, with truncated importance weights",
+        at_least=0,
+        read_when=readers.PPO,
+    )
     auxiliary: str = _update(
         "none",
         "a head that is trained along to predict the next observation, or, as MERL's released "

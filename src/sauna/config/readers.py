@@ -49,10 +49,11 @@ RANDOM = ("filter random-drop", lambda c: c.filter == "random-drop")
 OWN_FILTER = ("a filter of your own, module:name", lambda c: ":" in c.filter)
 SAMPLER = ("a sampler", lambda c: c.sampler != "none")
 MASKED = (
-    "a sampler with selection_losses=all, or a filter with dropped=mask",
+    "a sampler with selection_losses=all, a filter with dropped=mask, or replay_rollouts",
     lambda c: (
         (c.sampler != "none" and c.selection_losses == "all")
         or (c.filter != "none" and c.dropped == "mask")
+        or c.replay_rollouts > 0
     ),
 )
 CENTRED = ("advantage_sign both", lambda c: c.advantage_sign == "both")

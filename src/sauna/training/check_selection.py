@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.learner.replay import pool_rows
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.selection.registry import Rules, make_rules
 from sauna.algorithm.types import Choice, LossTerms, LossWeight, Sampler, Samples, StopRule
@@ -85,7 +86,7 @@ def _rules(config: Config, spaces: Spaces) -> Rules:
 
 def _trace(config: Config, spaces: Spaces, sampler: Sampler) -> tuple[Any, Any, Any]:
     """The sampler's state before and after a choice, and the choice, as shapes."""
-    rows = config.rollout_steps * config.envs
+    rows = pool_rows(config)
     number: Any = jax.ShapeDtypeStruct((rows,), jnp.float32)
     seen: Any = jax.ShapeDtypeStruct((rows, *spaces.observation_shape), spaces.observation_dtype)
     width = jnp.float32 if spaces.action_kind == "continuous" else jnp.int32
@@ -108,7 +109,7 @@ def _trace(config: Config, spaces: Spaces, sampler: Sampler) -> tuple[Any, Any, 
 
 
 def _check_sampler(config: Config, spaces: Spaces, sampler: Sampler) -> None:
-    name, rows = config.sampler, (config.rollout_steps * config.envs,)
+    name, rows = config.sampler, (pool_rows(config),)
     if not isinstance(sampler.share, int | float) or not 0 < sampler.share <= 1:
         raise BadInput(f"sampler: {name} has share {sampler.share!r}, which is not in (0, 1]")
     before, after, choice = _trace(config, spaces, sampler)

@@ -16,6 +16,7 @@ from sauna.algorithm.learner.metrics import (
     variance_explained,
 )
 from sauna.algorithm.learner.optimizers import moves_rate
+from sauna.algorithm.learner.replay import pool_rows, remember, with_replayed
 from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
 from sauna.algorithm.learner.update import Parts, loss_advantage, update_on_all, vex_targets
 from sauna.algorithm.selection.vex_filter import moved_threshold
@@ -41,6 +42,18 @@ def learn(
     """
     config = parts.config
     mean_target = weighted_mean(vex_targets(batch, parts.target), batch.weight)
+    explained = variance_explained(batch.return_, batch.value, batch.weight)
+    replay, state = state.replay, state._replace(replay=())
+    if parts.replay:
+        batch = with_replayed(
+            batch,
+            replay,
+            state.params,
+            hypers,
+            config=config,
+            policy=parts.policy,
+            target=parts.target,
+        )
     if needs_selection(parts):
         state, totals = update_on_selected(state, batch, rollout, hypers, order, key, parts=parts)
         losses, gradient_norm, work = _means(totals, batch, rollout, parts)
@@ -63,7 +76,7 @@ def learn(
         losses.kl,
         losses.clip_fraction,
         gradient_norm,
-        variance_explained(batch.return_, batch.value, batch.weight),
+        explained,
         mean_target,
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
@@ -72,7 +85,7 @@ def learn(
         is_finite & jnp.all(jnp.isfinite(state.params)),
         work,
     )
-    return state, metrics
+    return state._replace(replay=remember(replay, rollout) if parts.replay else ()), metrics
 
 
 def _means(
@@ -81,13 +94,15 @@ def _means(
     """Means over the steps taken, NaN if there was none; and the work done."""
     config, sampler = parts.config, parts.rules.sampler
     steps = totals.steps.astype(jnp.float32)
-    rows = config.rollout_steps * config.envs
+    rows = pool_rows(config)
     epochs = totals.epochs.astype(jnp.float32)
     only_forward: Any = 0.0
     if sampler is not None and sampler.reads_policy:
         only_forward = rows * (epochs if sampler.each_epoch else 1.0)
     if config.recompute_advantages:
         only_forward += rollout.vex.size * epochs
+    if parts.replay:
+        only_forward += rollout.vex.size * config.replay_rollouts
     present = jnp.sum(batch.weight)
     work = Work(
         gradient_steps=steps,

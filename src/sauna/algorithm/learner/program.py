@@ -10,6 +10,7 @@ import jax
 
 from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.metrics import UpdateMetrics
+from sauna.algorithm.learner.replay import empty_replay
 from sauna.algorithm.learner.samples import make_batch
 from sauna.algorithm.learner.update import Parts, init_state
 from sauna.algorithm.learner.vex_targets import make_target
@@ -46,7 +47,8 @@ def make_parts(config: Config, policy: Policy, spaces: Spaces) -> Parts:
       BadInput: a rule or a target cannot be made.
     """
     rules = make_rules(config, spaces.action_kind, spaces.action_sizes)
-    return Parts(config, policy, make_target(config), rules)
+    replay = partial(empty_replay, config, spaces) if config.replay_rollouts else None
+    return Parts(config, policy, make_target(config), rules, replay)
 
 
 def make_learner(config: Config, policy: Policy, spaces: Spaces) -> Learner:

@@ -23,17 +23,26 @@ def take(x: Array, rows: Array) -> Array:
     return x[rows, jnp.arange(rows.shape[1])]
 
 
-def advantages_over_all(rollout: Rollout, hypers: Hypers, bootstrap_truncated: bool) -> Array:
-    """GAE over every env step `[S, N]`, kept or not: no gap, no reward lost."""
+def advantages_over_all(
+    rollout: Rollout, hypers: Hypers, bootstrap_truncated: bool, trace: Array | None = None
+) -> Array:
+    """GAE over every env step `[S, N]`, kept or not: no gap, no reward lost.
+
+    Args:
+      trace: `[S, N]` of each step, how much of its advantage flows to the step before; None: 1.
+    """
     ended = rollout.terminated | rollout.truncated
     last = ~jnp.concatenate([rollout.valid[1:], jnp.zeros_like(rollout.valid[:1])])
     bootstrap = ~rollout.terminated if bootstrap_truncated else ~ended
+    flows = ~(ended | last)
+    if trace is not None:
+        flows = flows * jnp.concatenate([trace[1:], trace[-1:]])
     return gae(
         rollout.reward,
         rollout.value,
         rollout.next_value,
         bootstrap & rollout.valid,
-        ~(ended | last),
+        flows,
         hypers.gamma,
         hypers.gae_lambda,
     )
@@ -98,9 +107,26 @@ def make_batch(
     else:
         rows = kept_rows(rollout.keep, config.rollout_steps)
         advantage = advantages_over_kept(rollout, rows, hypers)
+    return flat_batch(
+        rollout, rows, advantage, advantage + take(rollout.value, rows), config, target
+    )
+
+
+def flat_batch(
+    rollout: Rollout,
+    rows: Array,
+    advantage: Array,
+    return_: Array,
+    config: Config,
+    target: VexTarget,
+) -> Batch:
+    """The kept steps of a rollout with their advantages and returns, flattened to `[T * N]`.
+
+    Args:
+      rows, advantage, return_: `[T, N]`.
+    """
     value = take(rollout.value, rows)
     weight = take(rollout.keep, rows).astype(jnp.float32)
-    return_ = advantage + value
     vex_target = jnp.zeros_like(value)
     if not target.per_minibatch:
         vex_target = target.target(return_, value, weight, episode_numbers(rollout, rows))
@@ -153,23 +179,32 @@ def next_observations(rollout: Rollout) -> tuple[Array, Array]:
     return following, (valid_next & ~ended).astype(jnp.float32)
 
 
+def with_values(rollout: Rollout, value: Array) -> Rollout:
+    """The rollout with other values `[S, N]` of its observations.
+
+    Where a step's successor is not a step of the rollout (at an episode's end, behind the last
+    step), its value stays that of collection.
+    """
+    last = ~jnp.concatenate([rollout.valid[1:], jnp.zeros_like(rollout.valid[:1])])
+    outside = rollout.terminated | rollout.truncated | last
+    following = jnp.concatenate([value[1:], value[-1:]])
+    return rollout._replace(
+        value=value, next_value=jnp.where(outside, rollout.next_value, following)
+    )
+
+
 def recomputed(
     batch: Batch, rollout: Rollout, value: Array, hypers: Hypers, *, config: Config
 ) -> Batch:
     """The batch with the advantages and returns that other values of the same steps give.
 
-    Where a step's successor is not a step of the rollout (at an episode's end, behind the last
-    step), its value stays that of collection. Value clipping goes on from the value at collection.
+    See `with_values` for the successors that are no step of the rollout. Value clipping goes on
+    from the value at collection.
 
     Args:
       value: `[S, N]` of the rollout's observations by today's network.
     """
-    last = ~jnp.concatenate([rollout.valid[1:], jnp.zeros_like(rollout.valid[:1])])
-    outside = rollout.terminated | rollout.truncated | last
-    following = jnp.concatenate([value[1:], value[-1:]])
-    now = rollout._replace(
-        value=value, next_value=jnp.where(outside, rollout.next_value, following)
-    )
+    now = with_values(rollout, value)
     if config.critic == "avec":
         now = with_unbiased_value(now, hypers, config)
     over_all = advantages_over_all(now, hypers, config.truncation == "bootstrap")

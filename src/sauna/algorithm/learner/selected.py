@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
+from sauna.algorithm.learner.replay import pool_rows
 from sauna.algorithm.learner.samples import recomputed
 from sauna.algorithm.learner.update import (
     Parts,
@@ -59,7 +60,8 @@ def needs_selection(parts: Parts) -> bool:
     """Whether something of a run's rules takes more than PPO's plain loop."""
     config, rules = parts.config, parts.rules
     masked = config.filter != "none" and config.dropped == "mask"
-    return masked or bool(rules.sampler or rules.stop) or config.recompute_advantages
+    chosen = bool(rules.sampler or rules.stop or parts.replay)
+    return masked or chosen or config.recompute_advantages
 
 
 def update_on_selected(
@@ -167,7 +169,7 @@ def choose(
 def drawn_length(parts: Parts) -> int:
     """K: the most rows that one epoch draws."""
     config, sampler = parts.config, parts.rules.sampler
-    rows = config.rollout_steps * config.envs
+    rows = pool_rows(config)
     if sampler is None or config.selection_losses == "policy":
         return rows
     return min(rows, max(1, math.ceil(sampler.share * rows - 1e-6)))
@@ -251,13 +253,16 @@ def minibatch(
         mask = mask * choice.keep[index]
     advantage = minibatch_advantage(rows._replace(weight=mask), parts.config)
     value_weight = choice.value_weight if for_all else None
+    scale = None if choice.weight is None else choice.weight[index]
+    if rows.importance is not None:
+        scale = rows.importance if scale is None else scale * rows.importance
     return Minibatch(
         rows=rows,
         value_rows=value_rows,
         advantage=advantage,
         vex_target=vex_targets(value_rows, parts.target),
         policy_mask=mask,
-        policy_scale=None if choice.weight is None else choice.weight[index],
+        policy_scale=scale,
         value_mask=value_rows.weight,
         value_scale=None if value_weight is None else value_weight[value_index],
     )

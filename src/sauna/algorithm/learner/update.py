@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,11 +13,12 @@ import optax
 from sauna.algorithm.learner import a2c, ppo
 from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
 from sauna.algorithm.learner.optimizers import moved_rate, moves_rate, optimizer, scaling
+from sauna.algorithm.learner.replay import pool_rows
 from sauna.algorithm.learner.vex_targets import VexTarget
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.selection.positive import cut_at_zero
 from sauna.algorithm.selection.registry import Rules
-from sauna.algorithm.types import Array, Batch, Hypers, TrainState
+from sauna.algorithm.types import Array, Batch, Hypers, Replay, TrainState
 from sauna.config.settings import Config
 
 
@@ -27,6 +29,7 @@ class Parts(NamedTuple):
     policy: Policy
     target: VexTarget
     rules: Rules
+    replay: Callable[[], Replay] | None = None  # makes an empty one; None: nothing is replayed
 
 
 def init_state(parts: Parts, key: Array) -> TrainState:
@@ -34,7 +37,8 @@ def init_state(parts: Parts, key: Array) -> TrainState:
     params = policy.init(key)
     carried = sampler.init() if sampler else ()
     rate = jnp.float32(0.0) if moves_rate(config) else ()
-    return TrainState(params, scaling(config, policy).init(params), carried, rate)
+    replay = parts.replay() if parts.replay else ()
+    return TrainState(params, scaling(config, policy).init(params), carried, rate, replay)
 
 
 def vex_targets(batch: Batch, target: VexTarget) -> Array:
@@ -143,17 +147,17 @@ def update_on_all(
 
 
 def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
-    """The order of the samples in every epoch of an update, `[epochs, T * N]` int32."""
-    samples = np.arange(config.rollout_steps * config.envs, dtype=np.int32)
+    """The order of the samples in every epoch of an update, `[epochs, M]` int32."""
+    samples = np.arange(pool_rows(config), dtype=np.int32)
     generator = np.random.default_rng([seed, iteration])
     return generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)
 
 
 def device_minibatch_order(config: Config, key: Array, length: int | None = None) -> Array:
-    """The order of the samples in every epoch `[epochs, T * N]`, or of the first `length` rows.
+    """The order of the samples in every epoch `[epochs, M]`, or of the first `length` rows.
 
     A permutation is a sort here, so that one of fewer rows takes less time.
     """
-    number = length or config.rollout_steps * config.envs
+    number = length or pool_rows(config)
     keys = jax.random.split(key, config.epochs)
     return jax.vmap(lambda key: jax.random.permutation(key, number))(keys)

@@ -84,6 +84,7 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
         config.steps // rows,
         action_kind,
         action_sizes,
+        config.replay_rollouts,
         config.distribution,
     )
     sampler = _made("sampler", config.sampler, SAMPLERS, Sampler, config.sampler_kwargs, setup)
@@ -91,8 +92,10 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
         "loss_weight", config.loss_weight, LOSS_WEIGHTS, LossWeight, config.loss_weight_kwargs
     )
     if config.control != "none":
-        if config.control == "stride" and rows > MAX_STRIDE_ROWS:
-            raise BadInput(f"control: stride takes at most {MAX_STRIDE_ROWS} rows, not {rows}")
+        if config.control == "stride" and setup.rows > MAX_STRIDE_ROWS:
+            raise BadInput(
+                f"control: stride takes at most {MAX_STRIDE_ROWS} rows, not {setup.rows}"
+            )
         sampler = sampler and controlled(config.control, sampler)
         weight = weight and controlled_weight(config.control, weight)
     beta = action_kind == "continuous" and config.distribution == "beta"

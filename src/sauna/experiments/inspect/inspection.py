@@ -24,6 +24,7 @@ from sauna.experiments.inspect.recording import Played, open_env, play_episodes
 from sauna.experiments.inspect.streams import more_plays, scaled, stacked, stream_of
 from sauna.system import run_directory
 from sauna.system.checkpoint import BadCheckpoint, under
+from sauna.system.errors import BadInput
 from sauna.training.artifact import Artifact
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters, unpack_learner
@@ -91,6 +92,8 @@ def examine(
     decisions = decide(config, scored, key, hypers, steps)
     found = None
     if reads_rollouts(config):
+        if config.replay_rollouts:
+            raise BadInput("inspect: what a rule takes of replayed rollouts is not shown")
         state = member_state(config, policy, artifact, own)
         parts = config, policy.policy, artifact.spaces, state, streams, decisions.spans
         found = until(learned(*parts, hypers, member.seed, iteration), steps)

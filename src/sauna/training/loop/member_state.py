@@ -21,7 +21,7 @@ from sauna.algorithm.policy.normalize import Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import Collected
 from sauna.algorithm.rollout.host import HostCollector
-from sauna.algorithm.types import TrainState
+from sauna.algorithm.types import Replay, Rollout, TrainState
 from sauna.envs.host.contract import HostEnvs
 from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.system.errors import SaunaError
@@ -135,7 +135,7 @@ def pack_member(
 def named_learner(policy: Policy, state: TrainState) -> dict[str, np.ndarray]:
     """What learning changes, as named arrays."""
     arrays = {f"params/{key}": value for key, value in named_params(policy, state.params).items()}
-    arrays |= named_optimizer(state) | named_sampler(state)
+    arrays |= named_optimizer(state) | named_sampler(state) | named_replay(state)
     if moves_rate_in(state):
         arrays["learning_rate"] = np.asarray(state.learning_rate)
     return arrays
@@ -153,7 +153,13 @@ def unpack_learner(
     if moves_rate_in(example):
         rate = jnp.asarray(fitting(own, "learning_rate", rate))
     params = flat_params(policy, example.params, under("params/", own))
-    return TrainState(params, unpack_optimizer(own, example), unpack_sampler(own, example), rate)
+    return TrainState(
+        params,
+        unpack_optimizer(own, example),
+        unpack_sampler(own, example),
+        rate,
+        unpack_replay(own, example),
+    )
 
 
 def moves_rate_in(state: TrainState) -> bool:
@@ -194,6 +200,31 @@ def unpack_sampler(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
     named = named_sampler(example)
     leaves = [jnp.asarray(fitting(own, name, place)) for name, place in named.items()]
     return jax.tree_util.tree_unflatten(structure, leaves)
+
+
+def named_replay(state: TrainState) -> dict[str, np.ndarray]:
+    """The rollouts that the update learns from again, as named arrays."""
+    if not isinstance(state.replay, Replay):
+        return {}
+    parts = {**state.replay.rollouts._asdict(), "number": state.replay.number}
+    return {f"replay/{name}": np.asarray(array) for name, array in parts.items()}
+
+
+def unpack_replay(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
+    """The inverse of `named_replay`.
+
+    Raises:
+      BadCheckpoint: an array is missing, or of another shape or type.
+    """
+    if not isinstance(example.replay, Replay):
+        return ()
+    named = named_replay(example)
+    found = {
+        name.removeprefix("replay/"): jnp.asarray(fitting(own, name, place))
+        for name, place in named.items()
+    }
+    number = found.pop("number")
+    return Replay(Rollout(**found), number)
 
 
 def unpack_optimizer(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
