@@ -17,6 +17,17 @@ SAMPLERS = (
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
 DISTRIBUTIONS = ("gaussian", "squashed", "beta", "gsde")
 BOUNDED = ("squashed", "beta")  # actions inside the bounds of their box by themselves
-NETWORKS = ("auto", "mlp", "nature-cnn")
+ACTIVATIONS = (
+    "tanh",
+    "relu",
+    "elu",
+    "gelu",
+    "leaky_relu",
+    "selu",
+    "sigmoid",
+    "silu",
+    "swish",
+)
+NETWORKS = ("auto", "mlp", "nature-cnn", "small-cnn", "impala-cnn")
 OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
 SCHEDULES = ("constant", "linear", "cosine")

@@ -20,6 +20,10 @@ NO_KL_RATE = (
 )
 ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
+VALUE_MLP = (
+    "the mlp network with trunk separate",
+    lambda c: c.network in ("auto", "mlp") and c.trunk == "separate",
+)
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
 LOG_STD = ("a distribution other than beta", lambda c: c.distribution != "beta")
 GSDE = ("distribution gsde", lambda c: c.distribution == "gsde")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sauna.config.checks import is_read
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.envs.spaces import difference
@@ -26,6 +27,8 @@ SHAPES = (
     "network",
     "hidden",
     "activation",
+    "layer_norm",
+    "value_hidden",
     "trunk",
     "distribution",
     "sde_expln",
@@ -105,7 +108,7 @@ def check_fits(artifact: Artifact, prepared: Prepared) -> None:
 
 
 def _matters(field: str, config: Config) -> bool:
-    return field not in ("hidden", "activation") or config.network == "mlp"
+    return is_read(field, config)
 
 
 def _text(value: Any) -> str:
