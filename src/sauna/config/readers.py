@@ -80,4 +80,6 @@ SCHEDULED = (
 )
 EVALUATED = ("eval_every above 0", lambda c: c.eval_every > 0)
 FINE_TUNED = ("init_from", lambda c: bool(c.init_from))
+DATA = "data:"  # before recorded episodes that init_from names
+CLONED = ("init_from data:...", lambda c: c.init_from.startswith(DATA))
 AUXILIARY = ("an auxiliary head", lambda c: c.auxiliary != "none")

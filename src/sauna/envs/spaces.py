@@ -290,6 +290,40 @@ def _box_writer(space: Any, rescale: bool) -> Callable[[np.ndarray], Any]:
     return chosen if len(shape) == 1 else lambda action: chosen(action).reshape(shape)
 
 
+def action_reader(space: Any, rescale: bool = False) -> Callable[[Any], np.ndarray]:
+    """A function from actions that `env.step` took `[L, ...]` to the network's `[L, A]`.
+
+    It is the inverse of `action_writer`; what that has clipped stays at the bound. It raises
+    `ValueError` for a choice that the space does not have.
+    """
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Box):
+        stretched = stretch(space) if rescale else None
+
+        def read(actions: Any) -> np.ndarray:
+            flat = np.asarray(actions, np.float64).reshape(len(actions), -1)
+            if stretched is None or flat.shape[1:] != stretched[0].shape:
+                return flat
+            bounded, center, half = stretched
+            return np.where(bounded, (flat - center) / half, flat)
+
+        return read
+    _, sizes = _describe_action(space)
+    choices = np.full(sizes, 2) if isinstance(space, gym.MultiBinary) else np.array(sizes)
+    start = np.asarray(getattr(space, "start", 0))
+
+    def read_choices(actions: Any) -> np.ndarray:
+        found = np.asarray(actions).reshape(len(actions), -1)
+        fits = found.shape[1] == choices.size and found.dtype.kind in "iub"
+        chosen = found.astype(np.int64) - start if fits else found
+        if not fits or ((chosen < 0) | (chosen >= choices)).any():
+            raise ValueError(f"its actions are none of {' '.join(str(space).split())}")
+        return chosen
+
+    return read_choices
+
+
 def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """How [-1, 1] is stretched to a box: `center + half * action` where `bounded`, all `[A]`.
 

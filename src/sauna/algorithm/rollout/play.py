@@ -18,6 +18,7 @@ from sauna.envs.device.contract import JaxEnv
 from sauna.envs.host.answers import one_number, reset_with
 from sauna.envs.info import IS_SUCCESS, SUCCESS_RATE, numbers_of
 
+_fold_in = jax.jit(jax.random.fold_in)  # compiled: a key is drawn at every env step
 _RESET = 2**31  # apart from the numbers of env steps, whose keys draw the actions
 
 
@@ -51,7 +52,7 @@ def play(
     watch()
     return_, length, ended, info = 0.0, 0, False, None
     while not ended and length < max_steps:
-        step_key = None if deterministic else jax.random.fold_in(key, length // hold)
+        step_key = None if deterministic else _fold_in(key, length // hold)
         action = policy(observation, deterministic=deterministic, key=step_key)
         observation, reward, terminated, truncated, info = env.step(action)
         return_, length = return_ + one_number(reward), length + 1
