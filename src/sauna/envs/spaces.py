@@ -27,6 +27,7 @@ class Spaces(NamedTuple):
     observation_structure: Any
     action_structure: Any
     observation_high: float = 255.0  # of an image's bytes: the networks here divide by it
+    action_bounded: bool = True  # whether each component of a continuous action has both bounds
 
     @property
     def observation_dtype(self) -> Any:
@@ -69,6 +70,8 @@ def difference(before: Spaces, now: Spaces) -> str:
     """
     for name in Spaces._fields:
         old, new = getattr(before, name), getattr(now, name)
+        if name == "action_bounded":
+            continue
         if name.endswith("structure") and not (isinstance(old, tuple) and isinstance(new, tuple)):
             continue  # text, of 0.1.0
         if old != new:
@@ -112,7 +115,8 @@ def describe(observation_space: Any, action_space: Any) -> Spaces:
     high = float(observation_space.high.max(initial=0)) if kind == "image" else 0.0
     action_kind, sizes = _describe_action(action_space)
     parts = _structure(observation_space), _structure(action_space)
-    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0)
+    bounded = action_kind != "continuous" or bool(bounded_components(action_space).all())
+    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0, bounded)
 
 
 def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
@@ -329,9 +333,15 @@ def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
       `(bounded, center, half)`, or None where nothing would change.
     """
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
-    bounded = (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)
+    bounded = bounded_components(space)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     center, half = (low + high) / 2, (high - low) / 2
     if np.all(center == 0.0) and np.all(half == 1.0):
         return None
     return bounded, center, half
+
+
+def bounded_components(space: Any) -> np.ndarray:
+    """Which components `[A]` of a box of actions have both bounds."""
+    low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+    return (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)

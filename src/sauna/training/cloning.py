@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sauna.config.choices import BOUNDED
 from sauna.config.presets import Member
 from sauna.config.readers import DATA
 from sauna.config.settings import Config
@@ -103,9 +104,14 @@ def _read(prepared: Prepared) -> Demonstrations:
     made = make_env(config.env, json.loads(config.env_kwargs))
     try:
         rescale = config.rescale_actions
-        return demonstrations(episodes, spaces, made.action_space, rescale, name)
+        data = demonstrations(episodes, spaces, made.action_space, rescale, name)
     finally:
         close(made)
+    if spaces.action_kind == "continuous" and config.distribution in BOUNDED:
+        from sauna.algorithm.policy.bounded import from_env
+
+        return data._replace(action=from_env(data.action))
+    return data
 
 
 def _moments(data: Demonstrations, config: Config) -> Moments | None:

@@ -31,6 +31,8 @@ SHAPES = (
     "layer_norm",
     "value_hidden",
     "trunk",
+    "distribution",
+    "sde_expln",
     "rescale_actions",
     "normalize_observations",
 )

@@ -119,8 +119,9 @@ def evaluate(
     for name in chosen:
         policy = TrainedPolicy(artifact, name, made, best)
         progress = Progress(name, episodes, say)
+        watch, hold = progress.step, policy.policy.hold
         played = [
-            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
+            progress.played(play(policy, made, deterministic, seed + i, watch, max_steps, hold))
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played) | success_rate(played)
