@@ -63,6 +63,7 @@ FLOORS = (
     "experiments.inspect",
     "experiments.bench",
     "experiments.study",
+    "experiments.tune",
     "experiments.share",
     "experiments",
     "api",

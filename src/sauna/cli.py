@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | plot | runs | study | ...`.
+"""The command line: `sauna train | resume | eval | inspect | compare | tune | plot | runs | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -29,6 +29,7 @@ from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.share import flags as sharing
+from sauna.experiments.tune.flags import add_tune, tune_from_flags
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
@@ -157,6 +158,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
         place = command.add_argument_group("where it trains")
         for name, how in _PLACE.items():
             place.add_argument(flag(name), **how)
+
+    add_tune(commands, values, _PLACE)
 
     text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
     plot = commands.add_parser("plot", help=text, allow_abbrev=False)
@@ -433,6 +436,7 @@ _COMMANDS = {
     "record": _record,
     "inspect": _inspect,
     "compare": _compare,
+    "tune": lambda values: tune_from_flags(values, _say),
     "plot": _plot,
     "runs": _runs,
     "study": _study,
