@@ -18,6 +18,7 @@ NO_KL_RATE = (
 )
 ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
+RECURRENT = ("recurrent lstm or gru", lambda c: c.recurrent != "none")
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
 VECTORS = (
     "vector observations: others have no running moments",

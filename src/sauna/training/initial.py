@@ -27,6 +27,8 @@ SHAPES = (
     "hidden",
     "activation",
     "trunk",
+    "recurrent",
+    "recurrent_width",
     "rescale_actions",
     "normalize_observations",
 )
@@ -103,6 +105,8 @@ def check_fits(artifact: Artifact, prepared: Prepared) -> None:
 
 
 def _matters(field: str, config: Config) -> bool:
+    if field == "recurrent_width":
+        return config.recurrent != "none"
     return field not in ("hidden", "activation") or config.network == "mlp"
 
 

@@ -21,6 +21,9 @@ class FrozenPolicy:
 
     The action is the distribution's mode unless `deterministic=False` and a key are given.
 
+    A recurrent policy remembers the observations that it is called with: call `reset` at the start
+    of an episode.
+
     Args:
       config: whose network and normalisation it has.
       spaces: of `env`.
@@ -35,6 +38,7 @@ class FrozenPolicy:
         self._dtype = spaces.observation_dtype
         self.policy: Policy = make_policy(config, spaces)
         self.params: Any = None
+        self.state: Any = ()  # [n, H] of a recurrent policy; () before an episode's first step
         self._moments: Moments | None = None
         self._act = jax.jit(self._choose, static_argnames="deterministic")
         self._predict = jax.jit(self._heads)
@@ -43,13 +47,29 @@ class FrozenPolicy:
     def load(self, params: Array, moments: Moments | None) -> None:
         """Takes over parameters `[D]` and moments of `[obs]`; None: nothing is normalised."""
         self.params, self._moments = jax.numpy.asarray(params), moments
+        self.reset()
 
-    def _choose(self, params: Array, observation: Any, key: Any, *, deterministic: bool) -> Any:
+    def reset(self, ended: Any = None) -> None:
+        """Forgets what was observed; a policy that is not recurrent has nothing to forget.
+
+        Args:
+          ended: `[n]` bool, which of a batch's episodes have ended; default all.
+        """
+        if ended is None or isinstance(self.state, tuple):
+            self.state = ()
+        else:
+            over = np.asarray(ended, bool).reshape(-1)
+            self.state = np.where(over[:, None], np.float32(0.0), self.state)
+
+    def _choose(
+        self, params: Array, observation: Any, state: Any, key: Any, *, deterministic: bool
+    ) -> Any:
         distribution = self.policy.distribution
-        parameters = self.policy.apply(params, observation).policy
+        output, state = self.policy.step(params, observation, state)
         if deterministic:
-            return distribution.mode(parameters)
-        return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
+            return distribution.mode(output.policy), state
+        noise = distribution.draw(key, output.policy.shape[:-1])
+        return distribution.sample(output.policy, noise), state
 
     def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
         """The action for a raw observation, clipped or stretched as the environment wants it.
@@ -59,7 +79,8 @@ class FrozenPolicy:
         is never updated.
 
         Raises:
-          BadInput: `observation` is not of the environment's space.
+          BadInput: `observation` is not of the environment's space, or a recurrent policy has
+            another number of episodes to remember.
         """
         rows, is_batch = self._rows(observation)
         actions = self._choices(rows, deterministic, key)
@@ -76,8 +97,26 @@ class FrozenPolicy:
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
         key = jax.random.key(0) if key is None else key
-        seen = self._seen(rows)
-        return np.asarray(self._act(self.params, seen, key, deterministic=deterministic))
+        state = self.state_for(len(rows))
+        actions, self.state = self._act(
+            self.params, self._seen(rows), state, key, deterministic=deterministic
+        )
+        return np.asarray(actions)
+
+    def state_for(self, number: int) -> Any:
+        """The states `[number, H]` with which as many episodes go on, or begin.
+
+        Raises:
+          BadInput: another number of episodes goes on.
+        """
+        if isinstance(self.state, tuple):
+            return self.policy.initial_state(number)
+        if len(self.state) != number:
+            raise BadInput(
+                f"a recurrent policy remembers {len(self.state)} episodes, and got observations of "
+                f"{number}; call reset() first"
+            )
+        return self.state
 
     def _rows(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Raw observations as arrays `[n, *obs]`, and whether they came as a batch."""
