@@ -18,7 +18,9 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 VENV := .venv
 VERSIONS := -c constraints.txt
 BIN := $(VENV)/bin
-INSTALL = $(BIN)/pip --disable-pip-version-check install $(VERSIONS) -e
+# pip compiles one file after the other; here all cores do, and leave out the packages' own tests.
+INSTALL = $(BIN)/pip --disable-pip-version-check install --no-compile $(VERSIONS) -e
+COMPILE = $(BIN)/python -m compileall -qq -j 0 -x '/tests/' $(VENV)/lib || true
 USE = @echo "To use sauna in this shell: source $(VENV)/bin/activate"
 
 .PHONY: setup setup-ci demo test test-faults test-newest test-slow campaign mutants soak cost docs lint constraints results clean
@@ -29,22 +31,27 @@ $(BIN)/python:
 
 $(VENV)/.run: $(BIN)/python pyproject.toml constraints.txt
 	$(INSTALL) .
+	@$(COMPILE)
 	@touch $@
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml constraints.txt
 	$(INSTALL) '.[dev]'
+	@$(COMPILE)
 	@touch $@ $(VENV)/.run
 
 $(VENV)/.ci: $(BIN)/python pyproject.toml constraints.txt
 	$(INSTALL) '.[dev,cluster]'
+	@$(COMPILE)
 	@touch $@ $(VENV)/.dev $(VENV)/.run
 
 $(VENV)/.slow: $(BIN)/python pyproject.toml constraints.txt
 	$(INSTALL) '.[dev,docs,cluster,brax,playground]'
+	@$(COMPILE)
 	@touch $@ $(VENV)/.ci $(VENV)/.dev $(VENV)/.docs $(VENV)/.run
 
 $(VENV)/.docs: $(BIN)/python pyproject.toml constraints.txt
 	$(INSTALL) '.[docs]'
+	@$(COMPILE)
 	@touch $@ $(VENV)/.run
 
 setup: $(VENV)/.dev
@@ -58,8 +65,11 @@ demo: $(VENV)/.run
 	$(USE)
 	@echo "Then try: sauna train CartPole-v1 --steps 100000, or: sauna compare InvertedPendulum-v5"
 
-# Half of the time of a first run is compiling: here without LLVM's optimisations.
-PYTEST = JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
+# Half of the time of a first run is compiling: here without LLVM's optimisations, and without XLA's
+# newer emitters of loops, which take twice as long. Processes find our own modules compiled.
+XLA := --xla_cpu_use_fusion_emitters=false
+PYTEST = PYTHONDONTWRITEBYTECODE= XLA_FLAGS="$(XLA)" JAX_DISABLE_MOST_OPTIMIZATIONS=1 \
+	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 15
 
 test: $(VENV)/.dev
 	$(PYTEST) -m 'not slow and not campaign'
@@ -69,7 +79,7 @@ test-faults: $(VENV)/.dev
 
 test-newest:
 	rm -rf .venv-newest
-	$(MAKE) setup-ci test test-faults VENV=.venv-newest VERSIONS=
+	$(MAKE) setup-ci test test-faults VENV=.venv-newest VERSIONS= XLA=
 
 test-slow: $(VENV)/.slow
 	$(BIN)/python -m pytest -m slow

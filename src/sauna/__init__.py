@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
+    from sauna.experiments.share.export import export
     from sauna.system.errors import BadInput, SaunaError
     from sauna.training.tracking.tracker import TrackedRun, Tracker
 
@@ -50,6 +51,7 @@ __all__ = [
     "VexTarget",
     "compare",
     "evaluate",
+    "export",
     "inspect",
     "load",
     "resume",
@@ -69,6 +71,7 @@ _HOMES = {
     "TrackedRun": "sauna.training.tracking.tracker",
     "Tracker": "sauna.training.tracking.tracker",
     "evaluate": "sauna.experiments.evaluate.episodes",
+    "export": "sauna.experiments.share.export",
     "inspect": "sauna.experiments.inspect.command",
     **dict.fromkeys(
         (

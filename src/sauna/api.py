@@ -269,7 +269,7 @@ def load(
     The action is the most likely one; `policy(observation, deterministic=False, key=...)` samples.
 
     Args:
-      path: the run directory.
+      path: the run directory; or an exported policy: its folder, `zoo:NAME`, `hf:USER/NAME`.
       member: name (`sauna/0`) or index.
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       best: as it was at its best evaluation during training (`eval_every`).
@@ -278,9 +278,11 @@ def load(
     """
     from sauna.experiments.evaluate.policy import TrainedPolicy
     from sauna.training.artifact import load_artifact
+    from sauna.training.located import locate
 
-    artifact = load_artifact(Path(path), iteration=checkpoint, trust=trust)
-    provide(Path(path), parts, PARTS)
+    folder = locate(path).folder
+    artifact = load_artifact(folder, iteration=checkpoint, trust=trust)
+    provide(folder, parts, PARTS)
     return TrainedPolicy(artifact, member, best=best)
 
 

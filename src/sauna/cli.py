@@ -28,6 +28,7 @@ from sauna.config.presets import (
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.evaluate import MAX_STEPS
+from sauna.experiments.share import flags as sharing
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
@@ -179,6 +180,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     bench.add_argument("--json", metavar="FILE", help="also write the figures there")
     own = ("env", "steps", "out")
     add_fields(bench, [n for n in FIELDS if n not in own], {**values, "seeds": 6})
+
+    sharing.add_commands(commands)
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
     lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
@@ -417,4 +420,5 @@ _COMMANDS = {
     "study": _study,
     "bench": _bench,
     "list": _list,
+    **sharing.COMMANDS,
 }

@@ -41,23 +41,15 @@ def test_these_are_the_eleven_tasks() -> None:
     assert len(NAMES) == len(TASKS) == 11
 
 
-@pytest.mark.parametrize(
-    "name, kwargs",
-    [
-        pytest.param(name, {}, marks=[pytest.mark.slow] * name.startswith("Humanoid"))
-        for name in NAMES
-    ]
-    + KWARGS,
-)
-def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
-    """Every task to its time limit, or through tens of falls; some rows stand still for a while."""
+def assert_equals_gymnasium(name: str, kwargs: dict, steps: int) -> int:
+    """Plays both, with rows that stand still for a while; returns how many episodes ended."""
     fast = in_process_envs(name, kwargs, SEEDS, "auto")
     plain = in_process_envs(name, kwargs, SEEDS, "gymnasium")
     assert type(fast) is MujocoEnvs and type(plain) is GymnasiumEnvs
     np.testing.assert_array_equal(fast.reset(), plain.reset())
     ends = 0
-    for t, action in enumerate(wide_actions(fast, 1030, seed=1)):
-        active = np.array([True, t % 50 != 7, not 200 < t < 205])
+    for t, action in enumerate(wide_actions(fast, steps, seed=1)):
+        active = np.array([True, t % 50 != 7, not 100 < t < 105])
         one, two = fast.step(action, active), plain.step(action, active)
         ended = active & (two.terminated | two.truncated)
         assert one.ended == two.ended == ended.any()
@@ -66,8 +58,30 @@ def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
         assert one.info == two.info and set(one.info) == set(np.flatnonzero(ended)), f"step {t}"
         np.testing.assert_array_equal(one.final_observation[ended], two.final_observation[ended])
         ends += ended.sum()
-    assert ends >= 3 if kwargs == {} else ends >= 1
     fast.close(), plain.close()
+    return ends
+
+
+@pytest.mark.parametrize(
+    "name, kwargs",
+    [
+        pytest.param(name, {}, marks=[pytest.mark.slow] * name.startswith("Humanoid"))
+        for name in NAMES
+    ]
+    + KWARGS,
+)
+def test_equals_gymnasium(name: str, kwargs: dict) -> None:
+    """Every task through falls, or to a time limit that comes twice."""
+    limit = {"max_episode_steps": 90}
+    assert assert_equals_gymnasium(name, {**limit, **kwargs}, steps=190) >= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, kwargs", [(name, {}) for name in NAMES] + KWARGS)
+def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
+    """Every task to its own time limit, or through tens of falls."""
+    ends = assert_equals_gymnasium(name, kwargs, steps=1030)
+    assert ends >= 3 if kwargs == {} else ends >= 1
 
 
 @pytest.mark.parametrize("name", NAMES)

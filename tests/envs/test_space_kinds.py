@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces as gym
@@ -13,7 +14,7 @@ from sauna.config.presets import resolve
 from sauna.config.settings import to_json
 from sauna.config.stored import stored_config
 from sauna.envs.device.contract import _reader, _writer
-from sauna.envs.spaces import action_writer, describe, observation_reader, read_spaces
+from sauna.envs.spaces import action_writer, board_of, describe, observation_reader, read_spaces
 from sauna.system.errors import BadInput
 
 TWO = gym.Discrete(2)
@@ -56,8 +57,11 @@ REFUSED = [
     (gym.Dict({"far": gym.Tuple((box(1), box(3, 64, 64)))}), "['far'][1]"),
     (gym.Dict({"goal": gym.Text(4)}), "['goal']: Text is not supported"),
     (gym.Tuple((TWO, gym.Sequence(box(1)))), "[1]: Sequence is not supported"),
-    (box(84, 84, 3), "(84, 84, 3) and type float32 are not supported (only uint8 is)"),
-    (box(60, 80, dtype=np.float64), "give bytes up to 255 as uint8 [H, W, C]"),
+    (
+        box(84, 84, 3, high=2.0),
+        "(84, 84, 3) and type float32 are not supported (only uint8 is, and a Box of floats from 0",
+    ),
+    (box(60, 80, dtype=np.float64, high=2.0), "give bytes up to 255 as uint8 [H, W, C]"),
     (box(4, 84, 84, 1, dtype=np.uint8, high=255), "give a stack as uint8 [H, W, frames x C]"),
 ]
 
@@ -76,6 +80,24 @@ def test_small_boards_and_masks_are_images_that_know_their_highest_byte() -> Non
         assert found.observation_shape == (*shape, 1)[:3]
     stored = list(found)[:-1]  # as runs before have it
     assert read_spaces(stored) == found
+
+
+def test_large_pictures_of_floats_in_0_to_1_are_pictures_and_small_ones_boards() -> None:
+    random = np.random.default_rng(0)
+    for shape, turned in (((3, 40, 36), (40, 36, 3)), ((36, 36), (36, 36, 1))):
+        space, seen = box(*shape), random.random(shape)
+        found = describe(space, TWO)
+        assert (found.observation_kind, found.observation_shape) == ("float_image", turned)
+        assert found.observation_dtype == np.float32 and board_of(found) == ()
+        expected = np.moveaxis(seen, 0, -1) if len(shape) == 3 else seen[..., None]
+        np.testing.assert_array_equal(observation_reader(space)(seen), expected)
+        np.testing.assert_allclose(_reader(space)(jnp.asarray(seen)), expected, rtol=1e-6)
+    small = describe(box(4, 10, 10), TWO)
+    assert (small.observation_kind, board_of(small)) == ("vector", (4, 10, 10))
+    for other in (box(400), gym.Tuple((box(4, 5),)), box(5, 5, dtype=np.uint8, high=3)):
+        assert board_of(describe(other, TWO)) == ()
+    assert board_of(small._replace(observation_structure=("Box", 3, 10, 10))) == ()
+    assert board_of(small._replace(observation_structure="Box")) == ()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

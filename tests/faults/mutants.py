@@ -329,8 +329,8 @@ MUTANTS = [
         ),
         (
             "activations swapped",
-            '"tanh": nn.tanh, "relu": nn.relu',
-            '"tanh": nn.relu, "relu": nn.tanh',
+            "getattr(nn, self.activation)",
+            'getattr(nn, {"tanh": "relu", "relu": "tanh"}[self.activation])',
         ),
     ),
     *_of(

@@ -71,11 +71,14 @@ def test_a_network_that_cannot_train_is_named_before_the_run(network: str, words
     assert text.startswith(f"network: own_networks:{network} ")
 
 
-def test_a_small_board_trains_with_an_mlp_and_with_ones_own_network() -> None:
-    job = make_job("worlds:Board", arm="ppo", **SMALL)
-    assert (job.config.network, job.spaces.observation_high) == ("mlp", 3.0)
+def test_a_small_board_trains_with_a_small_cnn_an_mlp_and_ones_own_network() -> None:
+    job = make_job("worlds:Board", arm="ppo", network="auto", **SETTINGS)
+    assert (job.config.network, job.spaces.observation_high) == ("small-cnn", 3.0)
+    kernel = train_here(job).final["ppo/0/params/policy_trunk/conv_0/kernel"]
+    assert kernel.shape == (3, 3, 1, 16)
+    job = make_job("worlds:Board", arm="ppo", network="mlp", **SETTINGS)
     kernel = train_here(job).final["ppo/0/params/policy_trunk/layer_0/kernel"]
-    assert kernel.shape == (25, 8)
+    assert kernel.shape == (25, 64)
     check_plugins(of("Embedded"), BOARD)
     job = make_job("worlds:Board", arm="ppo", network="own_networks:Embedded", **SETTINGS)
     assert len(train_here(job).rows) == 4

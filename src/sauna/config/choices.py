@@ -15,6 +15,17 @@ SAMPLERS = (
     "vex-oracle",
 )
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
-NETWORKS = ("auto", "mlp", "nature-cnn")
+ACTIVATIONS = (
+    "tanh",
+    "relu",
+    "elu",
+    "gelu",
+    "leaky_relu",
+    "selu",
+    "sigmoid",
+    "silu",
+    "swish",
+)
+NETWORKS = ("auto", "mlp", "nature-cnn", "small-cnn", "impala-cnn")
 OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
 SCHEDULES = ("constant", "linear", "cosine")

@@ -132,7 +132,7 @@ class Config(RunOptions):
 
     network: str = _network(
         "auto",
-        "trunk (auto: nature-cnn for images of 36 x 36 pixels or more, else mlp)",
+        "trunk (auto: for pictures nature-cnn from 36 x 36 pixels on, below small-cnn; else mlp)",
         choices=choices.NETWORKS,
         plugin=True,
     )
@@ -140,7 +140,18 @@ class Config(RunOptions):
         (64, 64), "widths of the MLP's hidden layers", at_least=1, read_when=readers.MLP
     )
     activation: str = _network(
-        "tanh", "the MLP's activation", choices=("tanh", "relu"), read_when=readers.MLP
+        "tanh", "the MLP's activation", choices=choices.ACTIVATIONS, read_when=readers.MLP
+    )
+    layer_norm: bool = _network(
+        False,
+        "normalise what each layer of the MLP adds up (Ba et al. 2016), before its activation",
+        read_when=readers.MLP,
+    )
+    value_hidden: tuple[int, ...] = _network(
+        (),
+        "widths of the value's hidden layers, if they are not the policy's",
+        at_least=1,
+        read_when=readers.VALUE_MLP,
     )
     trunk: str = _network(
         "separate", "whether policy and value share a trunk", choices=("separate", "shared")

@@ -64,7 +64,7 @@ SAME = {
     "net_arch": "hidden",
     "policy_kwargs": "hidden",
     "actor_hidden_dims": "hidden",
-    "critic_hidden_dims": "hidden",
+    "critic_hidden_dims": "value_hidden",
     "activation_fn": "activation",
     "init_noise_std": "log_std_init",
     "norm_obs": "normalize_observations",

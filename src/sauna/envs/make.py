@@ -13,8 +13,10 @@ from typing import Any
 from sauna.config.plugins import import_module, import_name, is_local
 from sauna.config.settings import NATIVE
 from sauna.envs.host.answers import close
+from sauna.envs.host.contract import HostEnvs
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.packages import as_vector, package_of, register
+from sauna.envs.host.together import is_known, maker_of, plain_maker, rows_of
 from sauna.envs.spaces import stretch
 from sauna.system.errors import BadInput, nearest, one_line
 
@@ -42,10 +44,12 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
 
         game = game_of(env)
         return lambda **more: AtariEnv(game, **{**env_kwargs, **more})
+    if is_known(env):
+        return plain_maker(maker_of(env), env_kwargs)
     if is_function_name(env):
         function = import_name("env", env)
         check_makes(env, function)
-        return lambda **more: function(**{**env_kwargs, **more})
+        return plain_maker(function, env_kwargs)
     import gymnasium
 
     name = _registered(env)
@@ -188,7 +192,7 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
     if hasattr(made, "single_observation_space") or hasattr(made, "env_is_wrapped"):
         raise BadInput(
             f"env: {_shown(env)} gives a vector of environments; give what makes one of them, and "
-            "their number as envs (--envs)"
+            "their number as envs (--envs), or let the function take num_envs"
         )
     if not hasattr(made, "observation_space"):
         raise BadInput(f"env: {_shown(env)} gives no environment, but {type(made).__name__}")
@@ -217,7 +221,7 @@ def in_process_envs(
     seeds: Sequence[tuple[int, int]],
     backend: str,
     rescale: bool = False,
-) -> GymnasiumEnvs:
+) -> HostEnvs:
     """M environments stepped in this process, by the fastest backend that gives the same bits.
 
     Args:
@@ -228,6 +232,15 @@ def in_process_envs(
     """
     env = one_name(env)
     make = env_maker(env, env_kwargs)
+    if is_known(env) or is_function_name(env):
+        first = make()
+        function = maker_of(env) if is_known(env) else import_name("env", env)
+        together = rows_of(function, env_kwargs, first, seeds, rescale)
+        if together is not None:
+            close(first)
+            return together
+        made = [first]  # which was only to be looked at
+        return GymnasiumEnvs(lambda: made.pop() if made else make(), seeds, rescale)
     if backend == "auto" and env.startswith("ALE/"):
         from sauna.envs.host.atari_envs import AtariEnvs
 

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_number
+from sauna.envs.host.parallel_envs import AgentsAsOne
+from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
 from sauna.envs.shapes import check_shapes
 from sauna.envs.spaces import Spaces, describe, observation_reader
@@ -21,12 +23,14 @@ class Probe(NamedTuple):
     Attributes:
       spaces: its spaces.
       differs: None where it gave the same episode twice.
+      group: rows that stand together (0: any number); None if each environment stands alone.
       time_limit: env steps after which Gymnasium cuts an episode; None if it says no number.
     """
 
     spaces: Spaces
     differs: str | None
     time_limit: int | None = None
+    group: int | None = None
 
 
 def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
@@ -42,6 +46,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     try:
         spaces = describe(first.observation_space, first.action_space)
         limit = getattr(getattr(first, "spec", None), "max_episode_steps", None)
+        group = group_size(first)
         _play(first, spaces, seed=1)
         differs = _difference(_play(first, spaces, seed=2), _play(second, spaces, seed=2))
     except BadInput:
@@ -51,7 +56,9 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     finally:
         close(first)
         close(second)
-    return Probe(spaces, differs, limit if isinstance(limit, int) else None)
+    if group == 0:
+        differs = differs or "a vector environment cannot be brought back row by row"
+    return Probe(spaces, differs, limit if isinstance(limit, int) else None, group)
 
 
 def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
@@ -129,8 +136,11 @@ def _arrays(tree: Any) -> Any:
 def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, bool]]:
     """`STEPS` steps of random actions: `(observation, reward, ended)` of each."""
     reader = observation_reader(env.observation_space)
+    agents = isinstance(env, AgentsAsOne)
 
     def read(observation: Any) -> np.ndarray:
+        if agents:
+            return np.stack([reader(one) for one in observation])
         found = np.array(reader(observation))
         if found.shape != spaces.observation_shape:
             raise ValueError(
@@ -143,7 +153,7 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
     seen = [(read(first_of(env.reset(seed=seed))), 0.0, False)]
     for _ in range(STEPS):
         observation, reward, terminated, truncated, info = five_of(
-            env.step(env.action_space.sample())
+            env.step(env.sample() if agents else env.action_space.sample())
         )
         life_lost(info)  # raises where it cannot be read
         seen.append((read(observation), one_number(reward), bool(terminated or truncated)))

@@ -12,13 +12,14 @@ from sauna.envs.shapes import shape_check
 from sauna.system.errors import BadInput
 
 SMALLEST_IMAGE = 36  # the Nature CNN's three convolutions need this many pixels
+PICTURES = ("image", "float_image")  # kinds of observations that are one picture
 MAX_BOUND = 1e30  # an action box this wide is not bounded: such bounds stand for none
 
 
 class Spaces(NamedTuple):
     """What the learner has to know of an environment's spaces."""
 
-    observation_kind: str  # vector | image | one_hot
+    observation_kind: str  # vector | image (bytes) | float_image (in [0, 1]) | one_hot
     observation_shape: tuple[int, ...]
     action_kind: str  # continuous | discrete | multi_discrete | multi_binary
     action_sizes: tuple[int, ...]  # (A,), (choices,), (choices, choices, ...), (bits,)
@@ -75,6 +76,17 @@ def difference(before: Spaces, now: Spaces) -> str:
     return ""
 
 
+def board_of(spaces: Spaces) -> tuple[int, ...]:
+    """The shape, of two or three axes, of a Box that is flattened to a vector; () for another."""
+    structure = spaces.observation_structure
+    if not isinstance(structure, tuple) or len(structure) not in (3, 4) or structure[0] != "Box":
+        return ()
+    shape = structure[1:]
+    is_whole = all(type(side) is int and side > 0 for side in shape)
+    fits = is_whole and spaces.observation_shape == (math.prod(shape),)
+    return shape if fits and spaces.observation_kind == "vector" else ()
+
+
 def _structure(space: Any) -> tuple[Any, ...]:
     """The kind of a space, and of its parts in the order in which they are flattened."""
     from gymnasium import spaces as gym
@@ -113,6 +125,8 @@ def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
 
     if _is_bytes(space):
         return "image", _channels_last(space.shape)
+    if _is_float_picture(space):
+        return "float_image", _channels_last(space.shape)
     _check_part(space, "")
     size = int(gym.utils.flatdim(space))
     if isinstance(space, gym.Discrete | gym.MultiDiscrete | gym.MultiBinary):
@@ -125,6 +139,16 @@ def _is_bytes(space: Any) -> bool:
     from gymnasium import spaces as gym
 
     return isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3)
+
+
+def _is_float_picture(space: Any) -> bool:
+    """Whether a space is a picture of floats in [0, 1]; small boards are vectors."""
+    from gymnasium import spaces as gym
+
+    if not isinstance(space, gym.Box) or not np.issubdtype(space.dtype, np.floating):
+        return False
+    large = sum(side >= SMALLEST_IMAGE for side in space.shape) >= 2 and len(space.shape) <= 3
+    return large and bool((space.low == 0).all() and (space.high == 1).all())
 
 
 def _check_part(space: Any, key: str) -> None:
@@ -162,7 +186,10 @@ def _instead(space: Any, key: str) -> str:
         )
     if len(space.shape) > 3:
         return f"(more than three axes): give a stack as uint8 [H, W, frames x C]; {flat}"
-    return f"(only uint8 is): give bytes up to 255 as uint8 [H, W, C]; {flat}"
+    return (
+        "(only uint8 is, and a Box of floats from 0 to 1): give bytes up to 255 as uint8 "
+        f"[H, W, C]; {flat}"
+    )
 
 
 def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
@@ -185,10 +212,10 @@ def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
 def _channels_last(shape: tuple[int, ...]) -> tuple[int, ...]:
     if len(shape) == 2:
         return (*shape, 1)
-    return (shape[1], shape[2], shape[0]) if _channels_first(shape) else shape
+    return (shape[1], shape[2], shape[0]) if channels_first(shape) else shape
 
 
-def _channels_first(shape: tuple[int, ...]) -> bool:
+def channels_first(shape: tuple[int, ...]) -> bool:
     """A stack of frames `[C, H, W]`: fewer channels in front than pixels behind."""
     return len(shape) == 3 and shape[0] < min(shape[1:])
 
@@ -201,10 +228,10 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     """
     from gymnasium import spaces as gym
 
-    if _is_bytes(space):
+    if _is_bytes(space) or _is_float_picture(space):
         if len(space.shape) == 2:
-            return lambda image: image[..., None]
-        if _channels_first(space.shape):
+            return lambda image: np.asarray(image)[..., None]
+        if channels_first(space.shape):
             return lambda image: np.moveaxis(np.asarray(image), 0, -1)
         return np.asarray
     if isinstance(space, gym.Box) and len(space.shape) == 1:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.host.contract import HostEnvs, Snapshot, Step
-from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import read_spaces
 from sauna.system.errors import SaunaError, one_line
@@ -146,7 +146,7 @@ class ProcessEnvs(HostEnvs):
         return True
 
 
-def _serve(envs: GymnasiumEnvs, message: Message) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _serve(envs: HostEnvs, message: Message) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """An answer's header and arrays."""
     header: dict[str, Any] = {"kind": "answer"}
     kind, arrays = message.header["kind"], message.arrays

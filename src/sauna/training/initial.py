@@ -6,19 +6,20 @@ other run does not matter any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sauna.config.checks import is_read
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.envs.spaces import difference
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
-from sauna.system.run_directory import INITIAL
-from sauna.training.artifact import Artifact, best_of, find_member, load_artifact
+from sauna.system.run_directory import INITIAL, is_exported
+from sauna.training.artifact import Artifact, find_member, load_artifact, policy_arrays
 from sauna.training.prepare import Prepared
 
 # What has to be the same, beside the spaces, for weights to mean the same.
@@ -26,6 +27,8 @@ SHAPES = (
     "network",
     "hidden",
     "activation",
+    "layer_norm",
+    "value_hidden",
     "trunk",
     "recurrent",
     "recurrent_width",
@@ -47,7 +50,7 @@ class Source:
 
 
 def _is_run(path: Path) -> bool:
-    return (path / "config.json").is_file()
+    return (path / "config.json").is_file() or is_exported(path)
 
 
 def read_initial(
@@ -74,7 +77,7 @@ def read_initial(
     chosen = {}
     for member in prepared.members:
         chosen[member.name] = name = _source_of(member, artifact.members, source.member)
-        own = _arrays_of(artifact, name, source.best, config.init_normalizer)
+        own = policy_arrays(artifact, name, source.best, config.init_normalizer)
         arrays |= {f"{member.name}/{key}": array for key, array in own.items()}
     manifest = artifact.checkpoint.manifest
     origin = {
@@ -105,9 +108,7 @@ def check_fits(artifact: Artifact, prepared: Prepared) -> None:
 
 
 def _matters(field: str, config: Config) -> bool:
-    if field == "recurrent_width":
-        return config.recurrent != "none"
-    return field not in ("hidden", "activation") or config.network == "mlp"
+    return is_read(field, config)
 
 
 def _text(value: Any) -> str:
@@ -131,31 +132,6 @@ def _source_of(member: Member, known: list[str], named: str) -> str:
             f"RUN/{known[0]} (there are: {', '.join(known)})"
         )
     return f"{arm}/{member.seed}"
-
-
-def _arrays_of(artifact: Artifact, name: str, best: bool, normalizer: str) -> dict[str, np.ndarray]:
-    """A member's parameters, and as much of its running statistics as is kept."""
-    own = checkpoint.under(f"{name}/", artifact.checkpoint.arrays)
-    policy = best_of(artifact, name) if best else own
-    found = {key: a for key, a in policy.items() if key.startswith("params/")}
-    if normalizer != "fresh":
-        found |= {key: a for key, a in policy.items() if key.startswith("observation_moments/")}
-    if normalizer == "kept":
-        found |= _reward_moments(own)
-    return found
-
-
-def _reward_moments(own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The running moments of rewards in float64, as the host has them."""
-    found = {}
-    for part in ("mean", "variance", "count"):
-        name = f"reward_moments/{part}"
-        if name in own:
-            found[name] = own[name]
-        elif f"collect/{name}" in own:
-            lost = own.get(f"collect/{name}_lost", np.zeros(1))
-            found[name] = own[f"collect/{name}"].astype(np.float64) + lost
-    return found
 
 
 def save_initial(run: Path, arrays: dict[str, np.ndarray], manifest: dict[str, Any]) -> None:

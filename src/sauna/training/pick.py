@@ -10,7 +10,7 @@ from sauna.config.presets import arm_settings, parse_all, resolve_run
 from sauna.config.settings import FIELDS, Config
 from sauna.config.zoo import AUTO, entry_of, preset_of_spaces
 from sauna.envs.probe import Probe
-from sauna.envs.spaces import SMALLEST_IMAGE
+from sauna.envs.spaces import PICTURES, SMALLEST_IMAGE
 from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import look_at, place
 
@@ -54,7 +54,7 @@ def pick(overrides: Mapping[str, Any]) -> Picked:
     found = _look(given)
     spaces = found.spaces
     large = min(spaces.observation_shape[:2], default=0) >= SMALLEST_IMAGE
-    pictures = spaces.observation_kind == "image" and large
+    pictures = spaces.observation_kind in PICTURES and large
     discrete = spaces.action_kind != "continuous"
     preset, why = preset_of_spaces(pictures, discrete, found.time_limit)
     said = f"preset {preset}: the zoo does not know this environment, and {why}"

@@ -15,7 +15,7 @@ from sauna.config.presets import Member, RunConfig, parse_all, resolve_run
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
-from sauna.envs.spaces import SMALLEST_IMAGE, Spaces
+from sauna.envs.spaces import PICTURES, SMALLEST_IMAGE, Spaces, board_of
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
 from sauna.training.loop.multihost import check_split, read_host_rank
@@ -132,6 +132,7 @@ def examine(run: RunConfig, overrides: Mapping[str, Any], found: Probe | None = 
     """
     found = found or look_at(run.config)
     run = _settle(run, found.spaces)
+    _check_together(run, found.group)
     parsed = parse_all(overrides)
     check_read_here(run.config, found.spaces, parsed)
     check_read(list(run.arms.values()), parsed)
@@ -194,6 +195,46 @@ def check_own_parts(prepared: Prepared) -> None:
         check_plugins(prepared.config, prepared.spaces)
 
 
+def _check_together(run: RunConfig, group: int | None) -> None:
+    """Refuses what rows that act together cannot do.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    config = run.config
+    if group is None:
+        return
+    if config.env_processes:
+        raise BadInput(f"env_processes: not read by {config.env}, which steps its rows by itself")
+    if config.filter != "none" and config.dropped == "replace":
+        raise BadInput(
+            f"dropped: the rows of {config.env} act together, so that no env can replace a step; "
+            "give mask (--dropped mask)"
+        )
+    if group and config.envs % group:
+        raise BadInput(f"envs: {config.envs} is no multiple of the {group} agents of {config.env}")
+
+
+def _network(config: Config, spaces: Spaces) -> str:
+    """Picks the network that `auto` stands for.
+
+    Raises:
+      BadInput: the one that is named does not fit the observations.
+    """
+    picture = spaces.observation_kind in PICTURES
+    large = picture and min(spaces.observation_shape[:2]) >= SMALLEST_IMAGE
+    if config.network == "auto":
+        return "nature-cnn" if large else "small-cnn" if picture else "mlp"
+    fits = large if config.network == "nature-cnn" else picture or bool(board_of(spaces))
+    if config.network.endswith("-cnn") and not fits:
+        least = f" (it needs {SMALLEST_IMAGE} x {SMALLEST_IMAGE} pixels)" * picture
+        raise BadInput(
+            f"network: {config.network} does not fit {spaces.observation_kind} observations of "
+            f"shape {spaces.observation_shape}{least}"
+        )
+    return config.network
+
+
 def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
     """Replaces what depends on the environment or the machine by what it comes to.
 
@@ -201,17 +242,7 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
       BadInput: the network does not fit the observations.
     """
     config = run.config
-    image = spaces.observation_kind == "image"
-    large = image and min(spaces.observation_shape[:2]) >= SMALLEST_IMAGE
-    network = config.network
-    if network == "auto":
-        network = "nature-cnn" if large else "mlp"
-    if network == "nature-cnn" and not large:
-        least = f" (it needs {SMALLEST_IMAGE} x {SMALLEST_IMAGE} pixels)" * image
-        raise BadInput(
-            f"network: {network} does not fit {spaces.observation_kind} observations of shape "
-            f"{spaces.observation_shape}{least}"
-        )
+    network = _network(config, spaces)
     predicted = math.prod(spaces.observation_shape)
     if config.auxiliary != "none" and predicted > MAX_PREDICTED:
         raise BadInput(

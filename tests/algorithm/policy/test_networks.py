@@ -17,6 +17,7 @@ from sauna.algorithm.policy.distributions import bernoulli, gaussian, multi_cate
 from sauna.algorithm.policy.networks import NatureCNN
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.rollout.actor import make_actor
+from sauna.config.choices import ACTIVATIONS
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
 from sauna.training.loop.member_state import flat_params, named_params
@@ -46,12 +47,23 @@ def test_initialisation_is_baselines() -> None:
     assert np.asarray(tree(log_std_init=-0.7)[1]["log_std"]).tolist() == pytest.approx([-0.7] * 3)
 
 
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_the_compiled_actor_has_every_activation_and_layer_norm(activation: str) -> None:
+    acts_as_the_network(
+        activation=activation, hidden="9,6", value_hidden="4", layer_norm="yes", envs=2
+    )
+    acts_as_the_network(activation=activation, hidden="5", envs=2)
+
+
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("trunk", ["separate", "shared"])
 @pytest.mark.parametrize("hidden", ["7", "64,64", "5,30,6"])
 def test_the_compiled_actor_acts_as_the_network(activation: str, trunk: str, hidden: str) -> None:
+    acts_as_the_network(activation=activation, trunk=trunk, hidden=hidden, envs=2)
+
+
+def acts_as_the_network(**settings) -> None:
     """Actions are the network's means plus the noise; observations far out saturate the tanh."""
-    settings = {"activation": activation, "trunk": trunk, "hidden": hidden, "envs": 2}
     config = configured(**settings)
     policy = make_policy(config, VECTOR)
     params = np.stack([policy.init(jax.random.key(seed)) for seed in range(3)])
@@ -92,6 +104,30 @@ def test_the_network_is_what_it_says() -> None:
             ):
                 expected = features(name) @ params[head]["kernel"] + params[head]["bias"]
                 np.testing.assert_allclose(got, expected, atol=1e-5)
+
+
+def test_layer_norm_and_the_values_widths_by_hand() -> None:
+    policy, params = tree(hidden="9,6", value_hidden="5", layer_norm="yes", activation="elu")
+    shapes = {
+        name: layer["kernel"].shape
+        for name, layer in params["value_trunk"].items()
+        if "kernel" in layer
+    }
+    assert shapes == {"layer_0": (11, 5)}
+    assert params["policy_trunk"]["layer_1"]["kernel"].shape == (9, 6)
+    flat = policy.init(jax.random.key(0))
+    flat += np.random.default_rng(0).normal(0, 0.3, flat.shape).astype(np.float32)
+    params = policy.unravel(flat)["params"]
+    x = seen = np.random.default_rng(1).normal(2, 3, (5, 11)).astype(np.float32)
+    for i in range(2):
+        layer, norm = (params["policy_trunk"][f"{kind}_{i}"] for kind in ("layer", "norm"))
+        x = x @ layer["kernel"] + layer["bias"]
+        x = (x - x.mean(1, keepdims=True)) / x.std(1, keepdims=True) * norm["scale"] + norm["bias"]
+        x = np.where(x > 0, x, np.exp(x) - 1)
+    expected = x @ params["policy_head"]["kernel"] + params["policy_head"]["bias"]
+    output = policy.apply(flat, seen)
+    np.testing.assert_allclose(output.policy[:, :3], expected, atol=1e-4)
+    assert output.hidden.shape == (5, 6) and output.value.shape == (5,)
 
 
 def test_the_vex_loss_reaches_the_value_trunk_only() -> None:

@@ -24,21 +24,31 @@ def dense(width: int, gain: float, name: str) -> nn.Dense:
 class MLP(nn.Module):
     """`[..., obs]` -> `[..., hidden[-1]]`, one activation after each layer.
 
-    Bytes `[..., H, W, C]` become one vector in [0, 1]: they are divided by `high`.
+    With `layer_norm` a layer's sums are normalised before it (Ba et al. 2016, eq. 4), each by the
+    mean and the variance over the layer, and then scaled and shifted by learned numbers.
+
+    A picture `[..., H, W, C]` (`axes` 3) becomes one vector. Its bytes are divided by `high`.
     """
 
     hidden: Sequence[int]
     activation: str = "tanh"
+    layer_norm: bool = False
     high: float = 255.0
+    axes: int = 1
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        activate = {"tanh": nn.tanh, "relu": nn.relu}[self.activation]
+        activate = getattr(nn, self.activation)
         x = observation
         if x.dtype == jnp.uint8:
             x = x.reshape((*x.shape[:-3], -1)).astype(jnp.float32) / self.high
+        elif self.axes == 3:
+            x = x.reshape((*x.shape[:-3], -1))
         for i, width in enumerate(self.hidden):
-            x = activate(dense(width, math.sqrt(2.0), f"layer_{i}")(x))
+            x = dense(width, math.sqrt(2.0), f"layer_{i}")(x)
+            if self.layer_norm:
+                x = nn.LayerNorm(name=f"norm_{i}")(x)
+            x = activate(x)
         return x
 
 

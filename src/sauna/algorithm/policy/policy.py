@@ -21,11 +21,12 @@ from sauna.algorithm.policy.distributions import (
     multi_categorical,
 )
 from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN
+from sauna.algorithm.policy.pictures import PICTURE_NETWORKS
 from sauna.algorithm.policy.recurrent import CELLS, STATES
 from sauna.algorithm.types import Array, Params, PolicyOutput
 from sauna.config.plugins import import_name
 from sauna.config.settings import Config
-from sauna.envs.spaces import Spaces
+from sauna.envs.spaces import Spaces, board_of
 from sauna.system.errors import BadInput, one_line
 
 
@@ -86,10 +87,16 @@ def make_trunk(config: Config, spaces: Spaces) -> Callable[[str, nn.Module | Non
     """
     high = spaces.observation_high
     if config.network == "mlp":
-        settings = {"hidden": config.hidden, "activation": config.activation, "high": high}
-        return partial(_named, partial(MLP, **settings))
+        settings = (config.activation, config.layer_norm, high, len(spaces.observation_shape))
+        widths = {"value_trunk": config.value_hidden or config.hidden}
+        return lambda name, parent: MLP(
+            widths.get(name, config.hidden), *settings, name=name, parent=parent
+        )
     if config.network == "nature-cnn":
         return partial(_named, partial(NatureCNN, high=high))
+    if config.network in PICTURE_NETWORKS:
+        make = PICTURE_NETWORKS[config.network]
+        return partial(_named, partial(make, high=high, board=board_of(spaces)))
     make = import_name("network", config.network)
     if isinstance(make, type) and issubclass(make, nn.Module):
         return partial(_named, make)

@@ -8,6 +8,7 @@ call of a JAX program costs more than they do; another network acts by such a ca
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -15,9 +16,12 @@ import numpy as np
 
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.memory import HostMemory
+from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.compiled import compiled
+
+_TANH, _RELU, _ELU, _GELU, _LEAKY_RELU, _SELU, _SIGMOID = range(7)  # places in ACTIVATIONS
 
 
 class Actor(Protocol):
@@ -73,13 +77,14 @@ class RecurrentActor(CompiledActor):
 class MLPActor:
     """Acts by a compiled loop, for the MLP trunks of `policy/networks.py`.
 
-    Each layer's weights have a last row, the biases.
+    Each layer's weights have a last row, the biases. Layers that are normalised have two rows in
+    `_norms`, scales and biases; others have none.
     """
 
     def __init__(self, config: Config, spaces: Spaces, policy: Policy, members: int) -> None:
         self._policy, self._sample = policy, _sampler(spaces)
         self._trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
-        self._tanh = config.activation == "tanh"
+        self._function = ACTIVATIONS.index(config.activation)
         self._layers = [f"layer_{i}" for i in range(len(config.hidden))]
         widths = [spaces.observation_shape[0], *config.hidden, policy.distribution.num_outputs]
         self._weights = tuple(
@@ -87,6 +92,9 @@ class MLPActor:
             for before, after in itertools.pairwise(widths)
         )
         self._hidden = np.zeros((len(self._layers), config.envs, max(config.hidden)), np.float32)
+        self._norms = tuple(
+            np.zeros((members, 2 * config.layer_norm, width), np.float32) for width in config.hidden
+        )
         self._scale = np.ones((members, 1, widths[-1]), np.float32)
 
     def load(self, params: np.ndarray) -> None:
@@ -95,6 +103,9 @@ class MLPActor:
             layers = [tree[self._trunk][name] for name in self._layers] + [tree["policy_head"]]
             for weight, layer in zip(self._weights, layers, strict=True):
                 weight[p, :-1], weight[p, -1] = layer["kernel"], layer["bias"]
+            for i, norm in enumerate(self._norms):
+                if len(norm[p]):
+                    norm[p] = [tree[self._trunk][f"norm_{i}"][name] for name in ("scale", "bias")]
             if "log_std" in tree:
                 self._scale[p] = np.exp(tree["log_std"])
 
@@ -103,13 +114,20 @@ class MLPActor:
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
         noisy = np.empty_like(noise)
-        _act(observation, self._weights, self._tanh, self._hidden, noise, noisy)
+        form = self._weights, self._norms, self._function
+        _act(observation, *form, self._hidden, noise, noisy)
         return self._sample(noisy)
 
 
 @compiled
 def _act(
-    observation: Any, weights: Any, is_tanh: bool, hidden: Any, noise: Any, noisy: Any
+    observation: Any,
+    weights: Any,
+    norms: Any,
+    function: int,
+    hidden: Any,
+    noise: Any,
+    noisy: Any,
 ) -> None:
     """Writes the policy head's outputs plus `noise`, member by member, to `noisy` `[P, N, M]`."""
     last = len(weights) - 1
@@ -120,11 +138,13 @@ def _act(
                 weight = weights[i][p]
                 y = hidden[i, n, : weight.shape[1]]
                 _affine(x, weight, y)
-                if is_tanh:
+                if len(norms[i][p]):
+                    _normalize(y, norms[i][p])
+                if function == _TANH:
                     _tanh(y)
                 else:
                     for j in range(len(y)):
-                        y[j] = max(y[j], np.float32(0))
+                        y[j] = _activated(y[j], function)
                 x = y
             y = noisy[p, n]
             _affine(x, weights[last][p], y)
@@ -147,6 +167,34 @@ def _affine(x: Any, weight: Any, y: Any) -> None:
     for k in range(whole, inputs):
         for j in range(len(y)):
             y[j] += x[k] * weight[k, j]
+
+
+@compiled
+def _normalize(y: Any, norm: Any) -> None:
+    """Layer normalisation in place, with flax's epsilon; `norm` `[2, len(y)]`: scales, biases."""
+    mean = y.mean()
+    scale = np.float32(1) / math.sqrt(((y - mean) ** 2).mean() + np.float32(1e-6))
+    for j in range(len(y)):
+        y[j] = (y[j] - mean) * scale * norm[0, j] + norm[1, j]
+
+
+@compiled
+def _activated(x: Any, function: int) -> Any:
+    """An activation but tanh, as `jax.nn` has it; `function` is its place in `ACTIVATIONS`."""
+    if function == _RELU:
+        return max(x, np.float32(0))
+    if function == _ELU:
+        return x if x > 0 else math.expm1(x)
+    if function == _GELU:  # by a tanh, as is the default there
+        inner = np.float32(math.sqrt(2 / math.pi)) * (x + np.float32(0.044715) * x**3)
+        return np.float32(0.5) * x * (1 + math.tanh(inner))
+    if function == _LEAKY_RELU:
+        return x if x > 0 else np.float32(0.01) * x
+    if function == _SELU:
+        inner = x if x > 0 else np.float32(1.6732632423543772) * math.expm1(x)
+        return np.float32(1.0507009873554805) * inner
+    sigmoid = 1 / (1 + math.exp(-x))
+    return sigmoid if function == _SIGMOID else x * sigmoid
 
 
 @compiled
@@ -197,6 +245,6 @@ def make_actor(
     """The fastest actor for the network of `config`; `memory` is read if it is recurrent."""
     if policy.state_size and memory is not None:
         return RecurrentActor(act, memory)
-    if config.network == "mlp" and spaces.observation_kind != "image":
+    if config.network == "mlp" and len(spaces.observation_shape) == 1:
         return MLPActor(config, spaces, policy, members)
     return CompiledActor(act)

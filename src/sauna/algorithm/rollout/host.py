@@ -29,6 +29,7 @@ from sauna.algorithm.rollout.moments import ObservationMoments, discounted_retur
 from sauna.algorithm.rollout.program import Program
 from sauna.algorithm.types import Hypers, Keys, Rollout, ScoredStep
 from sauna.envs.host.contract import HostEnvs, Step
+from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.info import info_means
 from sauna.envs.spaces import Spaces
 
@@ -79,6 +80,7 @@ class HostCollector:
         self._buffers: Any = self._allocate()  # a Rollout of numpy arrays [P, S, N, ...]
         self._rewards = np.zeros((len(keys), self._capacity, self._config.envs))
         self._over = np.zeros(self._rewards.shape, bool)  # episodes; a lost life is not one's end
+        self._idle = np.zeros(self._over.shape, bool)  # rows of envs that waited for an episode
         self._infos: list[list[Any]] = [[] for _ in keys]  # of each member's ended episodes
         self._chunks = chunk_sizes(self._config.rollout_steps)
         self._uncompiled = program.filter is not None  # without one, every segment is a rollout
@@ -121,7 +123,8 @@ class HostCollector:
         """Resets every environment; the first observations enter the running moments."""
         self.state.observation[:] = self._envs.reset().reshape(self.state.observation.shape)
         if self.observation_moments is not None:
-            self.observation_moments.see(self.state.observation, np.ones(self._shape, bool))
+            there = np.ones(self._shape, bool) & ~self._waiting()
+            self.observation_moments.see(self.state.observation, there)
 
     def collect(
         self, params: np.ndarray, hypers: list[Hypers], iteration: int, limit: np.ndarray
@@ -140,7 +143,7 @@ class HostCollector:
         buffers, members = self._buffers, range(len(self._keys))
         for name in ("valid", "keep", "terminated", "truncated"):
             getattr(buffers, name)[:] = False
-        self._over[:] = False
+        self._over[:], self._idle[:] = False, False
         self._infos = [[] for _ in members]
         if self._uncompiled:
             self._compile_segments(params[0], hypers[0])
@@ -188,7 +191,7 @@ class HostCollector:
         """A member's next segment, from row `t` on. It depends on nothing but the member."""
         steps = self._config.rollout_steps
         wanted = np.minimum(steps - self._buffers.keep[member].sum(0), limit[member] - t)
-        if self._config.dropped == "mask":
+        if self._config.dropped == "mask" or self._program.filter is None:
             wanted = np.minimum(wanted, steps - t)
         acting = wanted > 0
         self._memory.begin_segment(member)
@@ -220,17 +223,41 @@ class HostCollector:
         self._memory.acting = acting
         actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
+            if self._envs.waiting is not None:
+                self._memory.acting = acting & ~self._waiting()
             actions[row] = action = actor.act(observations[row], noise[row - first])
+            self._note_idle(row, acting)
             step = self._envs.step(action.reshape(-1, width), active)
             rewards[row] = step.reward.reshape(shape)
             seen = step.observation.reshape(seen.shape)
             if moments is None:
                 observations[row + 1] = seen
             else:
-                moments.see_and_normalize(seen, acting, observations[row + 1])
+                moments.see_and_normalize(seen, acting & ~self._waiting(), observations[row + 1])
             if step.ended:
                 self._note_ends(params, step, row, acting, final_values)
         self.state.observation[:] = seen
+
+    def _waiting(self) -> np.ndarray | np.bool:
+        """Which envs wait for their next episode: `[P, N]`, or False for none."""
+        waiting = self._envs.waiting
+        return np.False_ if waiting is None else waiting.reshape(self._shape)
+
+    def _note_idle(self, row: int, acting: np.ndarray) -> None:
+        """Writes which envs take no step in a row.
+
+        Raises:
+          EnvironmentFailure: a step filter, which looks at every row, would see it.
+        """
+        if self._envs.waiting is None or not self._envs.waiting.any():
+            return
+        if self._program.filter is not None or self._config.gae_over == "kept":
+            raise EnvironmentFailure(
+                "an environment waits for the others' episodes to end, and a step filter cannot "
+                "pass over that; train arms without one (ppo, or a sampler)"
+            )
+        self._idle[:, row] = acting & self._waiting()
+        self._buffers.valid[:, row] = acting & ~self._waiting()
 
     def _show(self) -> None:
         """Writes the current observations, normalised, to the first row."""
@@ -337,7 +364,7 @@ class HostCollector:
         """The value of each step's true successor, once all values are known."""
         buffers = self._buffers
         buffers.next_value[:, : rows - 1] = buffers.value[:, 1:rows]
-        steps = buffers.valid.sum(1)
+        steps = (buffers.valid | self._idle).sum(1)
         for member in np.flatnonzero(steps.any(1)):
             last = steps[member] - 1
             after = self._values(params, self.state.observation, int(member))
@@ -366,7 +393,7 @@ class HostCollector:
     def _finish(self, member: int) -> list[Episode]:
         """Scales a member's rewards; its episodes, in the order in which they ended."""
         buffers, state = self._buffers, self.state
-        used = int(buffers.valid[member].any(1).sum())
+        used = int((buffers.valid | self._idle)[member].any(1).sum())
         valid = buffers.valid[member, :used]
         reward = np.where(valid, self._rewards[member, :used], 0.0)
         ended = (buffers.terminated | buffers.truncated)[member, :used]
@@ -379,7 +406,7 @@ class HostCollector:
                 Episode(
                     env,
                     running_sum(returns[env], reward[starts[env] : row + 1, env]),
-                    int(lengths[env]) + row + 1 - starts[env],
+                    int(lengths[env] + valid[starts[env] : row + 1, env].sum()),
                     bool(buffers.truncated[member, row, env]),
                     bool(buffers.keep[member, row, env]),
                 )
@@ -387,7 +414,7 @@ class HostCollector:
             returns[env], lengths[env], starts[env] = 0.0, 0, row + 1
         for env, start in enumerate(starts):
             returns[env] = running_sum(returns[env], reward[start:, env])
-            lengths[env] += max(int(valid[:, env].sum()) - start, 0)
+            lengths[env] += int(valid[start:, env].sum())
         return episodes
 
     def _scaled(

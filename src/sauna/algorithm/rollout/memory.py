@@ -18,7 +18,8 @@ class HostMemory:
 
     Attributes:
       state: `[P, N, H]` before the coming row; it persists between rollouts.
-      acting: `[P, N]` bool; the states of the other environments stay.
+      acting: `[P, N]` bool; the states of the other environments stay. Behind a row in which one
+        does not act, it starts an episode, if it acts at all.
       rollout: `Memory` of the rollout, arrays with a leading axis P; None if nothing is remembered.
     """
 
@@ -60,6 +61,8 @@ class HostMemory:
             self.rollout.state[:, self._row // self._length] = self.state
         np.copyto(self.state, state, where=self.acting[..., None])
         self._row += 1
+        if self._row < self.rollout.start.shape[1]:
+            self.rollout.start[:, self._row] = ~self.acting
 
     def forget(self, over: np.ndarray) -> None:
         """Forgets the episodes that are over (`[P, N]`) with the row before."""
@@ -67,4 +70,4 @@ class HostMemory:
             return
         self.state[over] = 0.0
         if self._row < self.rollout.start.shape[1]:
-            self.rollout.start[:, self._row] = over
+            self.rollout.start[:, self._row] |= over

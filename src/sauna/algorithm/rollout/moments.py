@@ -108,20 +108,20 @@ def discounted_returns(
     """`G_t = gamma G_{t-1} + r_t`, begun anew after each episode.
 
     Args:
-      reward, ended, valid: `[S, N]`; only the first rows of a column are valid.
+      reward, ended, valid: `[S, N]`; a row that is not valid is passed over.
       start: `[N]`, G before the first row.
 
     Returns:
       G `[S, N]` (0 where not valid), and what the next rollout starts from `[N]`.
     """
-    sums, last, steps = np.zeros(reward.shape), start.copy(), valid.sum(0).tolist()
-    for n, number in enumerate(steps):  # plain floats: numpy would cost more per number
-        now, column = float(start[n]), []
-        pairs = zip(reward[:number, n].tolist(), ended[:number, n].tolist(), strict=True)
+    sums, last = np.zeros(reward.shape), start.copy()
+    for n in range(reward.shape[1]):  # plain floats: numpy would cost more per number
+        now, column, on = float(start[n]), [], valid[:, n]
+        pairs = zip(reward[on, n].tolist(), ended[on, n].tolist(), strict=True)
         for r, end in pairs:
             now = now * gamma + r
             column.append(now)
             if end:
                 now = 0.0
-        sums[:number, n], last[n] = column, now
+        sums[on, n], last[n] = column, now
     return sums, last

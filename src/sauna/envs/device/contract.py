@@ -118,7 +118,7 @@ def _reader(space: Any) -> Callable[[Any], Array]:
     """The device's twin of `spaces.observation_reader`."""
     from gymnasium import spaces as gym
 
-    from sauna.envs.spaces import describe_observation
+    from sauna.envs.spaces import PICTURES, describe_observation
 
     if isinstance(space, gym.Discrete):
         return lambda x: jax.nn.one_hot(x - space.start, int(space.n))
@@ -129,7 +129,7 @@ def _reader(space: Any) -> Callable[[Any], Array]:
         readers = {name: _part_reader(part) for name, part in parts}
         return lambda x: jnp.concatenate([read(x[name]) for name, read in readers.items()])
     kind, shape = describe_observation(space)
-    if kind == "image":
+    if kind in PICTURES:
         if shape != space.shape and len(space.shape) == 3:
             return lambda image: jnp.moveaxis(image, 0, -1)
         return lambda image: image.reshape(shape)

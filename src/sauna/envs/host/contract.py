@@ -12,6 +12,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from sauna.envs.spaces import Spaces
+
 Snapshot = dict[str, np.ndarray]
 NO_INFO: Mapping[int, Mapping[str, float]] = MappingProxyType({})
 
@@ -34,7 +36,16 @@ class Step(NamedTuple):
 
 
 class HostEnvs(Protocol):
-    """M environments behind one interface."""
+    """M environments behind one interface.
+
+    Attributes:
+      spaces: of one environment.
+      waiting: `[M]` bool, rows that wait for their next episode: whatever action they get, they
+        take no env step, and what they show is no observation. None: no row ever waits.
+    """
+
+    spaces: Spaces
+    waiting: np.ndarray | None = None
 
     def reset(self) -> np.ndarray:
         """Starts episode 0 everywhere; observations `[M, *obs]`."""

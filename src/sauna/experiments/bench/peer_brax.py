@@ -68,8 +68,8 @@ def rate(overrides: dict[str, Any], iterations: int) -> float:
         network_factory=functools.partial(
             networks.make_ppo_networks,
             policy_hidden_layer_sizes=config.hidden,
-            value_hidden_layer_sizes=config.hidden,
-            activation={"tanh": jax.nn.tanh, "relu": jax.nn.relu}[config.activation],
+            value_hidden_layer_sizes=config.value_hidden or config.hidden,
+            activation=getattr(jax.nn, config.activation),
         ),
         progress_fn=lambda steps, metrics: seen.append((time.perf_counter(), steps)),
         **more,

@@ -49,7 +49,7 @@ class TrainedPolicy(FrozenPolicy):
         own = under(self.name + "/", artifact.checkpoint.arrays)
         if best:
             own = best_of(artifact, self.name)
-        if len(config.hidden) > len(own):  # each layer has arrays of its own
+        if len(config.hidden + config.value_hidden) > len(own):  # each layer has arrays of its own
             raise BadCheckpoint(f"{artifact.checkpoint.path}: it lacks layers that its config has")
         super().__init__(config, artifact.spaces, env)
         if made:

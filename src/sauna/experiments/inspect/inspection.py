@@ -15,6 +15,7 @@ from sauna.algorithm.learner.program import make_learner
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
+from sauna.envs.host.parallel_envs import AgentsAsOne
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frames_per_second
@@ -79,6 +80,8 @@ def examine(
         raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
     config, iteration = member.config, int(manifest["iteration"])
     env, drawer = open_env(config.env, json.loads(config.env_kwargs), frames, say)
+    if isinstance(env, AgentsAsOne):
+        raise BadInput("inspect: a page shows one agent; an environment of several cannot be shown")
     policy = TrainedPolicy(artifact, name, env)
     played = play_episodes(policy, env, episodes, deterministic, seed, drawer, max_steps, say)
     steps, steps_per_second = len(played.reward), frames_per_second(env)
