@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
+    from sauna.experiments.record import record
     from sauna.experiments.share.export import export
     from sauna.system.errors import BadInput, SaunaError
     from sauna.training.tracking.tracker import TrackedRun, Tracker
@@ -54,6 +55,7 @@ __all__ = [
     "export",
     "inspect",
     "load",
+    "record",
     "resume",
     "train",
 ]
@@ -73,6 +75,7 @@ _HOMES = {
     "evaluate": "sauna.experiments.evaluate.episodes",
     "export": "sauna.experiments.share.export",
     "inspect": "sauna.experiments.inspect.command",
+    "record": "sauna.experiments.record",
     **dict.fromkeys(
         (
             "Choice",

@@ -249,7 +249,7 @@ def test_advantages_over_kept_steps_are_the_updates() -> None:
         "keep": keep,
         "valid": np.ones((length, 1), bool),
     }
-    stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields))
+    stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields[:-1]))
     hypers = hypers_of(config)
     update = jax.jit(partial(make_batch, config=config, target=make_target(config)))
     batch = update(stream, hypers, jax.random.key(0))

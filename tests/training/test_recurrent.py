@@ -116,6 +116,7 @@ def test_what_cannot_work_is_refused_in_one_line() -> None:
     assert "needs a minibatch in random order" in refused(arm="delight+random")
     assert "use next-observation" in refused(auxiliary="shuffled-observation")
     assert "needs recurrent lstm or gru" in refused(recurrent="none")
+    assert "cloned step by step" in refused(init_from="data:x.parquet")
     assert "not read with recurrent gru" in refused(replay_rollouts=1)
 
 

@@ -81,6 +81,12 @@ ARMS = [
     pytest.param("sauna", {"keep_rate_target": 0.6}, marks=slow),
     pytest.param("sauna", {"threshold": 0.9, "recurrent": "gru", **REMEMBERING}, marks=slow),
     pytest.param("ppo", {"recurrent": "lstm", **REMEMBERING}, marks=slow),
+    pytest.param(
+        "sauna", {"threshold": 0.9, "distribution": "gsde", "sde_sample_freq": 5}, marks=slow
+    ),
+    pytest.param("ppo", {"distribution": "gsde", "sde_expln": True}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "distribution": "squashed"}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "distribution": "beta"}, marks=slow),
     pytest.param("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}, marks=slow),
     pytest.param(
         "sauna", {"threshold": 0.9, "reset": "cached", "normalize_rewards": False}, marks=slow

@@ -14,13 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from sauna.algorithm.policy.bounded import beta, squashed
 from sauna.algorithm.policy.distributions import (
     Distribution,
     bernoulli,
     gaussian,
     multi_categorical,
 )
-from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN
+from sauna.algorithm.policy.gsde import deviation, explore, gsde
+from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN, StateNoise
 from sauna.algorithm.policy.pictures import PICTURE_NETWORKS
 from sauna.algorithm.policy.recurrent import CELLS, STATES
 from sauna.algorithm.types import Array, Params, PolicyOutput
@@ -38,6 +40,8 @@ class Policy(NamedTuple):
       apply: `(params, observation [..., *obs]) -> PolicyOutput`; a recurrent policy refuses it.
       unravel: `params [D] -> the flax parameter pytree`.
       distribution: of the actions.
+      sample: `(params, output, noise [..., M]) -> action [..., A]`.
+      hold: env steps for which one draw of noise is kept.
       state_size: H, numbers of the state of a recurrent policy in one environment; else 0.
       unroll: of a recurrent policy, `(params, observation [L, B, *obs], start [L, B], state [B, H])
         -> PolicyOutput [L, B, ...]` over L env steps; `start` says with which an episode starts.
@@ -47,6 +51,8 @@ class Policy(NamedTuple):
     apply: Callable[[Array, Array], PolicyOutput]
     unravel: Callable[[Array], Params]
     distribution: Distribution
+    sample: Callable[[Array, PolicyOutput, Array], Array]
+    hold: int = 1
     state_size: int = 0
     unroll: Callable[[Array, Array, Array, Array], PolicyOutput] | None = None
 
@@ -71,9 +77,11 @@ class Policy(NamedTuple):
         return jax.tree.map(lambda x: x[0], output), state
 
 
-def make_distribution(spaces: Spaces) -> Distribution:
+def make_distribution(config: Config, spaces: Spaces) -> Distribution:
     if spaces.action_kind == "continuous":
-        return gaussian(spaces.action_sizes[0])
+        size = spaces.action_sizes[0]
+        made = {"squashed": squashed, "beta": beta}.get(config.distribution, gaussian)
+        return made(size)
     if spaces.action_kind == "multi_binary":
         return bernoulli(spaces.action_sizes[0])
     return multi_categorical(spaces.action_sizes)
@@ -138,7 +146,8 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     Raises:
       BadInput: the network is none, or keeps more than parameters.
     """
-    distribution = make_distribution(spaces)
+    distribution = make_distribution(config, spaces)
+    noise = state_noise(config, spaces)
     network = ActorCritic(
         make_trunk(config, spaces),
         distribution.num_outputs,
@@ -146,12 +155,13 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         config.trunk == "shared",
         0 if config.auxiliary == "none" else math.prod(spaces.observation_shape),
         _cell_maker(config),
+        noise,
     )
-    size = state_size(config)
-    lead = (1, 1) if size else (1,)
+    remembers = state_size(config)
+    lead = (1, 1) if remembers else (1,)
     example: Any = [jnp.zeros((*lead, *spaces.observation_shape), spaces.observation_dtype)]
-    if size:
-        example += [jnp.zeros((1, 1), bool), jnp.zeros((1, size), jnp.float32)]
+    if remembers:
+        example += [jnp.zeros((1, 1), bool), jnp.zeros((1, remembers), jnp.float32)]
     variables = jax.eval_shape(network.init, jax.random.key(0), *example)
     check_collections(config, variables)
     unravel = _unraveler(variables)
@@ -165,9 +175,30 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     def unroll(params: Array, observation: Array, start: Array, state: Array) -> PolicyOutput:
         return network.apply(unravel(params), observation, start, state)
 
-    if size:
-        return Policy(init, _no_apply, unravel, distribution, size, unroll)
-    return Policy(init, apply, unravel, distribution)
+    memory: tuple[Any, ...] = ()
+    if remembers:
+        apply, memory = _no_apply, (remembers, unroll)
+    if noise is None:
+
+        def sample(params: Array, output: PolicyOutput, noise: Array) -> Array:
+            return distribution.sample(output.policy, noise)
+
+        return Policy(init, apply, unravel, distribution, sample, 1, *memory)
+    features, size = variables["params"]["log_std"].shape
+
+    def explored(params: Array, output: PolicyOutput, matrix: Array) -> Array:
+        std = deviation(unravel(params)["params"]["log_std"], noise.expln)
+        return explore(output.policy[..., :size], output.hidden, std, matrix)
+
+    hold = config.sde_sample_freq or config.rollout_steps
+    return Policy(init, apply, unravel, gsde(size, features), explored, hold, *memory)
+
+
+def state_noise(config: Config, spaces: Spaces) -> StateNoise | None:
+    """Returns how the exploration depends on the state; None if it does not."""
+    if spaces.action_kind != "continuous" or config.distribution != "gsde":
+        return None
+    return StateNoise(config.sde_expln, config.sde_learn_features)
 
 
 def state_size(config: Config) -> int:
@@ -203,7 +234,7 @@ def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Arra
     Args:
       observation: `[N, *obs]` normalised; noise: `[N, M]` from `distribution.draw`.
     """
-    return policy.distribution.sample(policy.apply(params, observation).policy, noise)
+    return policy.sample(params, policy.apply(params, observation), noise)
 
 
 def score(policy: Policy, params: Array, observation: Array, action: Array) -> Array:
@@ -227,7 +258,7 @@ def act_with_state(
 ) -> tuple[Array, Array]:
     """Actions `[N, A]` of a recurrent policy, and its states `[N, H]` after them; see `act`."""
     output, state = policy.step(params, observation, state)
-    return policy.distribution.sample(output.policy, noise), state
+    return policy.sample(params, output, noise), state
 
 
 def score_with_state(

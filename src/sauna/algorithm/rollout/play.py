@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import MAX_STEPS
@@ -17,6 +18,7 @@ from sauna.envs.device.contract import JaxEnv
 from sauna.envs.host.answers import one_number, reset_with
 from sauna.envs.info import IS_SUCCESS, SUCCESS_RATE, numbers_of
 
+_fold_in = jax.jit(jax.random.fold_in)  # compiled: a key is drawn at every env step
 _RESET = 2**31  # apart from the numbers of env steps, whose keys draw the actions
 
 
@@ -36,6 +38,7 @@ def play(
     seed: int,
     watch: Callable[[], None] = lambda: None,
     max_steps: int = MAX_STEPS,
+    hold: int = 1,
 ) -> Episode:
     """Plays one episode, cut after `max_steps` env steps.
 
@@ -43,6 +46,7 @@ def play(
       policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes;
         its `reset()` is called first, if it has one.
       watch: called after the reset and after each env step.
+      hold: env steps for which sampled actions have one key; see `Policy.hold`.
     """
     key = jax.random.key(seed)
     getattr(policy, "reset", lambda: None)()
@@ -50,7 +54,7 @@ def play(
     watch()
     return_, length, ended, info = 0.0, 0, False, None
     while not ended and length < max_steps:
-        step_key = None if deterministic else jax.random.fold_in(key, length)
+        step_key = None if deterministic else _fold_in(key, length // hold)
         action = policy(observation, deterministic=deterministic, key=step_key)
         observation, reward, terminated, truncated, info = env.step(action)
         return_, length = return_ + one_number(reward), length + 1
@@ -111,10 +115,10 @@ def play_on_device(
             seen = normalize(moments, seen, config.clip_observations)
         output, memory = policy.step(params, seen, now.memory)
         if deterministic:
-            return distribution.mode(output.policy), memory
-        own = jax.vmap(jax.random.fold_in, (0, None))(keys, now.t)
+            return to_env(distribution, distribution.mode(output.policy)), memory
+        own = jax.vmap(jax.random.fold_in, (0, None))(keys, now.t // policy.hold)
         noise = jax.vmap(lambda key: distribution.draw(key, ()))(own)
-        return distribution.sample(output.policy, noise), memory
+        return to_env(distribution, policy.sample(params, output, noise)), memory
 
     def step(now: _Now) -> _Now:
         action, memory = act(now)
