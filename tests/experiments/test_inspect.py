@@ -121,6 +121,7 @@ def scored(vex: np.ndarray) -> ScoredStep:
 def test_lost_lives_and_signs_are_what_is_learned() -> None:
     """Three lives of two steps in one game, rewards 5 and -3."""
     policy: Any = SimpleNamespace(
+        reset=lambda: None,
         see=np.asarray,
         act=lambda observation, deterministic, key: np.array([1]),
         write=lambda action: action[0],
