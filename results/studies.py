@@ -55,8 +55,8 @@ WHY = {
     "here, so this study uses 0.8.",
     "actions-mountain-car": "The goal is found by chance alone, so that the return depends on how "
     "actions are drawn. All else is the preset, whose numbers were chosen for the Gaussian.",
-    "actions-bipedal": "A robot that walks. All else is the preset, whose numbers are RL Zoo's; "
-    "the noise of `gsde` stays for 4 env steps.",
+    "actions-bipedal": "A robot that walks, in a short training: 8 environments and rollouts of "
+    "512 steps, else the preset, whose numbers are RL Zoo's. `gsde` keeps its noise for 4 steps.",
     "pong": "One seed is no comparison. It shows how far a million env steps go on Atari.",
     "noise": "The paper says that the dropped samples are noisy. The policy gradient of dropped "
     "steps was measured at five checkpoints of each seed.",
