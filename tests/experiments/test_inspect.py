@@ -122,6 +122,7 @@ def test_lost_lives_and_signs_are_what_is_learned() -> None:
     """Three lives of two steps in one game, rewards 5 and -3."""
     policy: Any = SimpleNamespace(
         reset=lambda: None,
+        policy=SimpleNamespace(state_size=0),
         see=np.asarray,
         act=lambda observation, deterministic, key: np.array([1]),
         write=lambda action: action[0],
