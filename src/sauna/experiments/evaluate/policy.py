@@ -59,7 +59,7 @@ class TrainedPolicy(FrozenPolicy):
         params = flat_params(self.policy, example, under("params/", own))
         moments = None
         if config.normalize_observations:
-            size = artifact.spaces.observation_shape
+            size = (artifact.spaces.normalized,)
             parts = {"mean": size, "variance": size, "count": (1,)}
             moments = Moments(
                 **{
@@ -89,6 +89,7 @@ class TrainedPolicy(FrozenPolicy):
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = False,
+        action_masks: Any = None,
     ) -> tuple[Any, Any]:
         """The same with the arguments, the default and the answer of Stable-Baselines3's `predict`.
 
@@ -97,6 +98,7 @@ class TrainedPolicy(FrozenPolicy):
         Args:
           state: of a recurrent policy, what the call before gave; None: episodes begin.
           episode_start: `[n]` bool, which episodes begin all the same; of a recurrent policy.
+          action_masks: of the valid actions, as sb3-contrib's `MaskablePPO.predict` takes them.
 
         Returns:
           the action, and the state after it (None of a policy that is not recurrent).
@@ -106,13 +108,14 @@ class TrainedPolicy(FrozenPolicy):
         """
         key = jax.random.fold_in(jax.random.key(0), self._calls)
         self._calls += 1
+        how: dict[str, Any] = {"deterministic": deterministic, "action_mask": action_masks}
         if not self.policy.state_size:
-            return self(observation, deterministic=deterministic, key=key), None
+            return self(observation, key=key, **how), None
         before, self.state = self.state, () if state is None else state
         if episode_start is not None:
             self.reset(episode_start)
         try:
-            return self(observation, deterministic=deterministic, key=key), self.state
+            return self(observation, key=key, **how), self.state
         finally:
             self.state = before
 
