@@ -94,8 +94,8 @@ class FrozenPolicy:
             masks.
 
         Raises:
-          BadInput: `observation` is not of the environment's space, the mask is none, or a recurrent
-            policy has another number of episodes to remember.
+          BadInput: `observation` is not of the environment's space, the mask is none, or a
+            recurrent policy has another number of episodes to remember.
         """
         rows, is_batch = self._rows(self._with_mask(observation, action_mask))
         actions = self._choices(rows, deterministic, key)
