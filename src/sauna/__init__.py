@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
+    from sauna.experiments.record import record
     from sauna.experiments.share.exchange import pull, push
     from sauna.experiments.share.export import export
     from sauna.system.errors import BadInput, SaunaError
@@ -57,6 +58,7 @@ __all__ = [
     "load",
     "pull",
     "push",
+    "record",
     "resume",
     "train",
 ]
@@ -78,6 +80,7 @@ _HOMES = {
     "pull": "sauna.experiments.share.exchange",
     "push": "sauna.experiments.share.exchange",
     "inspect": "sauna.experiments.inspect.command",
+    "record": "sauna.experiments.record",
     **dict.fromkeys(
         (
             "Choice",

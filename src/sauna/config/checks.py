@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -156,6 +157,7 @@ def check_rules(config: Config) -> None:
             if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
                 raise BadInput(f"{name}: needs gae_over=all")
     check_passes(config)
+    check_distribution(config)
     if config.replay_rollouts:
         check_replay(config)
     if config.normalize_over == "kept" and config.sampler == "none":
@@ -164,6 +166,25 @@ def check_rules(config: Config) -> None:
         raise BadInput(
             "objective: unclipped needs a stop rule (espo) or a loss_weight "
             "(sample-dropout): nothing else bounds the ratio"
+        )
+
+
+def check_distribution(config: Config) -> None:
+    """Refuses rules that need a formula which the actions' distribution lacks.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.distribution == "gsde" and config.sampler == "gradient-norm":
+        raise BadInput(
+            "sampler: gradient-norm has no formula for the gradient of distribution gsde; it has "
+            "one for gaussian, squashed and beta"
+        )
+    whole = json.loads(config.loss_weight_kwargs).get("on") == "all"
+    if config.distribution == "beta" and config.loss_weight == "delight" and not whole:
+        raise BadInput(
+            "loss_weight: delight weighs the gradient of the mean, which distribution beta has "
+            'no parameter for; loss_weight_kwargs {"on": "all"} weighs it whole'
         )
 
 

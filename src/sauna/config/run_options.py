@@ -152,7 +152,8 @@ class RunOptions:
     init_from: str = _run(
         "",
         "start from the weights of a trained run: RUN, or RUN/ARM/SEED for one member of it; with "
-        "/best behind it, as of its best evaluation",
+        "/best behind it, as of its best evaluation; or from a clone of recorded episodes: "
+        "data:FILE.parquet, data:minari:NAME",
     )
     init_normalizer: str = _run(
         "observations",
@@ -160,6 +161,15 @@ class RunOptions:
         "observations alone, or none (fresh)",
         choices=("kept", "observations", "fresh"),
         read_when=readers.FINE_TUNED,
+    )
+    clone_epochs: int = _run(
+        20,
+        "passes over recorded episodes before training begins",
+        at_least=1,
+        read_when=readers.CLONED,
+    )
+    clone_learning_rate: float = _run(
+        1e-3, "Adam's step size in these passes", above=0, read_when=readers.CLONED
     )
 
     eval_every: int = _evaluation(

@@ -1,4 +1,4 @@
-"""Fine-tuning: the weights and the normaliser of a trained run, from which a new run starts.
+"""The weights and the normaliser from which a new run starts: of a trained run, or of a clone.
 
 They are copied into the new run's directory before it begins (`init/`), so that what becomes of the
 other run does not matter any more.
@@ -20,6 +20,7 @@ from sauna.system import checkpoint
 from sauna.system.errors import BadInput
 from sauna.system.run_directory import INITIAL, is_exported
 from sauna.training.artifact import Artifact, find_member, load_artifact, policy_arrays
+from sauna.training.cloning import clone_members, is_data
 from sauna.training.prepare import Prepared
 
 # What has to be the same, beside the spaces, for weights to mean the same.
@@ -30,6 +31,8 @@ SHAPES = (
     "layer_norm",
     "value_hidden",
     "trunk",
+    "distribution",
+    "sde_expln",
     "rescale_actions",
     "normalize_observations",
 )
@@ -61,11 +64,13 @@ def read_initial(
 
     Raises:
       BadInput: there is no such run or member, it is somebody else's and not trusted, or its spaces
-        or its network differ; the part is named.
+        or its network differ; the part is named. Or recorded episodes cannot be cloned.
     """
     config = prepared.config
     if not config.init_from:
         return None
+    if is_data(config.init_from):
+        return clone_members(prepared, say)
     source = Source(config.init_from)
     if not _is_run(source.run):
         raise BadInput(f"init_from: {config.init_from} is no run, and no RUN/ARM/SEED of one")

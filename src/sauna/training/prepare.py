@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sauna.config.checks import check_read, check_read_here, local_parts, own_parts
+from sauna.config.choices import BOUNDED
 from sauna.config.presets import Member, RunConfig, parse_all, resolve_run
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
@@ -239,7 +240,7 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
     """Replaces what depends on the environment or the machine by what it comes to.
 
     Raises:
-      BadInput: the network does not fit the observations.
+      BadInput: the network does not fit the observations, or the distribution the actions.
     """
     config = run.config
     network = _network(config, spaces)
@@ -248,6 +249,11 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
         raise BadInput(
             f"auxiliary: an observation has {predicted:,} numbers; a head predicts at most "
             f"{MAX_PREDICTED:,}"
+        )
+    if config.distribution in BOUNDED and not spaces.action_bounded:
+        raise BadInput(
+            f"distribution: {config.distribution} needs bounds of every action; {config.env} has "
+            "components without (gaussian and gsde do not need them)"
         )
     number = len(run.members)
     processes = config.processes or os.cpu_count() or 1

@@ -94,7 +94,7 @@ def evaluate(
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
     artifact = load_artifact(run, say, checkpoint, trust=trust)
-    env = _provided(run, env, parts)
+    env = provided(run, env, parts)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]
     own = artifact.config.env
     mode = "deterministic" if deterministic else "sampled"
@@ -119,8 +119,9 @@ def evaluate(
     for name in chosen:
         policy = TrainedPolicy(artifact, name, made, best)
         progress = Progress(name, episodes, say)
+        watch, hold = progress.step, policy.policy.hold
         played = [
-            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
+            progress.played(play(policy, made, deterministic, seed + i, watch, max_steps, hold))
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played) | success_rate(played)
@@ -143,7 +144,7 @@ def evaluate(
     return result
 
 
-def _provided(run: Path, env: Any, parts: Mapping[str, Any]) -> str | None:
+def provided(run: Path, env: Any, parts: Mapping[str, Any]) -> str | None:
     """The name of another environment, if one is asked for; parts of the run are put in place."""
     if env is not None and not isinstance(env, str):
         if is_local(

@@ -79,7 +79,8 @@ def record_video(
             try:
                 policy = TrainedPolicy(artifact, member, drawn, best)
                 with video(part, frames_per_second(drawn)) as add:
-                    play(policy, drawn, deterministic, seed, lambda: add(drawn.render()), max_steps)
+                    watch, hold = lambda: add(drawn.render()), policy.policy.hold
+                    play(policy, drawn, deterministic, seed, watch, max_steps, hold)
             finally:
                 close(drawn)
     except SaunaError:

@@ -28,7 +28,7 @@ class Played(NamedTuple):
     """`L` env steps, episode after episode; the last one may have been left before its end."""
 
     observation: np.ndarray  # [L, *obs] what the network got
-    action: np.ndarray  # [L, A] what the network chose, neither clipped nor stretched
+    action: np.ndarray  # [L, A] what the network chose, as a rollout holds it
     reward: np.ndarray  # [L] float64, raw
     terminated: np.ndarray  # [L] bool
     truncated: np.ndarray  # [L] bool, never together with terminated
@@ -167,7 +167,8 @@ def play_episodes(
     recorder = Recorder(env, policy, frames, max_steps)
     progress, returns = Progress(policy.name, episodes, say), []
     for i in range(episodes):
-        episode = play(recorder.act, recorder, deterministic, seed + i, progress.step, max_steps)
+        watch, hold = progress.step, policy.policy.hold
+        episode = play(recorder.act, recorder, deterministic, seed + i, watch, max_steps, hold)
         returns.append(progress.played(episode).return_)
     progress.say_cut(max_steps)
     return _played(recorder, returns, frames)
@@ -187,7 +188,8 @@ def play_steps(
     recorder, episode = Recorder(env, policy, None, max_steps), first
     while (left := steps - len(recorder.transitions)) > 0:
         own_seed = episode_seed(seed, number, episode)
-        play(recorder.act, recorder, deterministic, own_seed, max_steps=min(left, max_steps))
+        most, hold = min(left, max_steps), policy.policy.hold
+        play(recorder.act, recorder, deterministic, own_seed, max_steps=most, hold=hold)
         episode += 1
     recorder.leave()
     return _played(recorder, [], None)

@@ -52,7 +52,8 @@ def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]
     episodes, seen = [], np.zeros(0, bool)
     for i in range(EPISODES):
         pitches: list[float] = []
-        played = play(policy, env, False, SEED + i, lambda: pitches.append(pitch(env)))  # noqa: B023
+        watch, hold = lambda: pitches.append(pitch(env)), policy.policy.hold  # noqa: B023
+        played = play(policy, env, False, SEED + i, watch, hold=hold)
         upright = np.cos(pitches) > 0
         seen = np.concatenate([seen, upright])
         episodes.append(
@@ -93,7 +94,8 @@ def _draw(
 
     try:
         env = make_drawn_env(artifact.config.env, kwargs)
-        play(TrainedPolicy(artifact, name, env), env, False, SEED + shown, look)
+        policy = TrainedPolicy(artifact, name, env)
+        play(policy, env, False, SEED + shown, look, hold=policy.policy.hold)
     except Exception as error:  # renderers fail in every way there is
         return {"frames": [], "not_drawn": not_drawn(error)}
     strip = Image.new("RGB", (SIDE * len(pictures), SIDE))

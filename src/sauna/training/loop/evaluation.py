@@ -225,8 +225,8 @@ class HostPlayer:
             self._env = make_env(config.env, dict(self._job.env_kwargs))
             self._policy = FrozenPolicy(config, self._job.spaces, self._env)
         self._policy.load(frozen.params, frozen.moments)
-        deterministic = config.eval_deterministic
-        return [play(self._policy, self._env, deterministic, seed) for seed in seeds]
+        how, hold = config.eval_deterministic, self._policy.policy.hold
+        return [play(self._policy, self._env, how, seed, hold=hold) for seed in seeds]
 
     def close(self) -> None:
         """Closes the environment, if there is one."""
