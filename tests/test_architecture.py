@@ -18,6 +18,8 @@ FLOORS = (
     "envs.info",
     "envs.shapes",
     "envs.spaces",
+    "envs.stacked",
+    "envs.wrapping",
     "envs.device",
     "envs.flagrun",
     "envs.host",

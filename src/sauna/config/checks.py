@@ -110,6 +110,22 @@ def check_consistent(config: Config) -> None:
     check_rules(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
+    for path in config.wrap:
+        check_wrapper(path)
+
+
+def check_wrapper(path: str) -> None:
+    """Refuses a wrapper that no worker could import and call.
+
+    Raises:
+      BadInput: it is none; naming it.
+    """
+    if ":" not in path:
+        raise BadInput(f"wrap: {path!r} is no module:function")
+    if is_local(path):
+        raise BadInput("wrap: a wrapper has to be importable; put it at the top level of a module")
+    if not callable(import_name("wrap", path)):
+        raise BadInput(f"wrap: {path} cannot be called with an environment")
 
 
 def check_rate(config: Config) -> None:

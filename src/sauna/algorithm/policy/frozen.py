@@ -14,6 +14,7 @@ from sauna.algorithm.types import Array
 from sauna.config.settings import Config
 from sauna.envs.shapes import batch_size, one_of
 from sauna.envs.spaces import Spaces, action_writer, observation_reader
+from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system.errors import BadInput
 
 
@@ -30,8 +31,8 @@ class FrozenPolicy:
 
     def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
         self.config = config
-        self._space = env.observation_space
-        self._read = observation_reader(env.observation_space)
+        self._space = wrapped_space(env, wrapping_of(config))
+        self._read = observation_reader(self._space)
         self._write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
         self.policy: Policy = make_policy(config, spaces)
