@@ -12,6 +12,7 @@ from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Array
 from sauna.config.settings import Config
+from sauna.envs.masked import MASK, OBSERVATION, flat_masks, is_masked
 from sauna.envs.shapes import batch_size, one_of
 from sauna.envs.spaces import Spaces, action_writer, observation_reader
 from sauna.envs.wrapping import wrapped_space, wrapping_of
@@ -32,6 +33,7 @@ class FrozenPolicy:
     def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
         self.config = config
         self._space = wrapped_space(env, wrapping_of(config))
+        self._sizes = spaces.action_sizes if spaces.mask else ()  # of the masks
         self._read = observation_reader(self._space)
         self._write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
@@ -54,21 +56,49 @@ class FrozenPolicy:
         noise = distribution.draw(key, output.policy.shape[:-1])
         return self.policy.sample(params, output, noise)
 
-    def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
+    def __call__(
+        self,
+        observation: Any,
+        *,
+        deterministic: bool = True,
+        key: Any = None,
+        action_mask: Any = None,
+    ) -> Any:
         """The action for a raw observation, clipped or stretched as the environment wants it.
 
         A batch of observations (each array with one more axis, in front) gives an array of actions.
         Each new size of a batch is compiled once. Sampled actions need a JAX `key`; the normaliser
         is never updated.
 
+        Args:
+          action_mask: of the valid actions, `[K]` or `[n, K]`, for a policy that was trained with
+            masks.
+
         Raises:
-          BadInput: `observation` is not of the environment's space.
+          BadInput: `observation` is not of the environment's space, or the mask is none.
         """
-        rows, is_batch = self._rows(observation)
+        rows, is_batch = self._rows(self._with_mask(observation, action_mask))
         actions = self._choices(rows, deterministic, key)
         if is_batch:
             return np.stack([np.asarray(self.write(action)) for action in actions])
         return self.write(actions[0])
+
+    def _with_mask(self, observation: Any, action_mask: Any) -> Any:
+        """An observation together with its mask, as the space of masked observations has it."""
+        if action_mask is None:
+            if self._sizes and not is_masked(observation):
+                raise BadInput(
+                    "action_mask: this policy was trained with masks; "
+                    "call policy(observation, action_mask=mask)"
+                )
+            return observation
+        if not self._sizes:
+            raise BadInput("action_mask: not read by a policy that was trained without masks")
+        try:
+            masks = flat_masks(action_mask, self._sizes)
+        except ValueError as error:
+            raise BadInput(f"action_mask: {error}") from None
+        return {OBSERVATION: observation, MASK: masks}
 
     def write(self, action: np.ndarray) -> Any:
         """What the environment takes of what the network chooses `[A]`."""

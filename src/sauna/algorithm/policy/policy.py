@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
@@ -15,6 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from sauna.algorithm.policy.bounded import beta, squashed
+from sauna.algorithm.policy.combined import Combined, MakeTrunk
 from sauna.algorithm.policy.distributions import (
     Distribution,
     bernoulli,
@@ -23,11 +25,12 @@ from sauna.algorithm.policy.distributions import (
 )
 from sauna.algorithm.policy.gsde import deviation, explore, gsde
 from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN, StateNoise
+from sauna.algorithm.policy.observation import seen_of, valid_logits
 from sauna.algorithm.policy.pictures import PICTURE_NETWORKS
 from sauna.algorithm.types import Array, Params, PolicyOutput
 from sauna.config.plugins import import_name
 from sauna.config.settings import Config
-from sauna.envs.spaces import Spaces, board_of
+from sauna.envs.spaces import Spaces, board_of, picture_alone, seen_spaces
 from sauna.system.errors import BadInput, one_line
 
 
@@ -61,12 +64,15 @@ def make_distribution(config: Config, spaces: Spaces) -> Distribution:
     return multi_categorical(spaces.action_sizes)
 
 
-def make_trunk(config: Config, spaces: Spaces) -> Callable[[str, nn.Module | None], nn.Module]:
+def make_trunk(config: Config, spaces: Spaces) -> MakeTrunk:
     """A function `(name, parent) -> trunk` that builds what `config.network` names.
 
     Raises:
       BadInput: a user's `module:name` is not a flax module, nor a function that gives one.
     """
+    spaces = seen_spaces(spaces)
+    if spaces.pictures:
+        return _combined_trunk(config, spaces)
     high = spaces.observation_high
     if config.network == "mlp":
         settings = (config.activation, config.layer_norm, high, len(spaces.observation_shape))
@@ -92,6 +98,20 @@ def make_trunk(config: Config, spaces: Spaces) -> Callable[[str, nn.Module | Non
         raise BadInput(f"network: {config.network} is not a flax.linen module{why}")
     # Copied with its parts: flax lets modules that hold the same instance share its parameters.
     return lambda name, parent: copy.deepcopy(module).clone(name=name, parent=parent)
+
+
+def _combined_trunk(config: Config, spaces: Spaces) -> MakeTrunk:
+    """Of observations that hold pictures beside something else: `config.network` is a picture's.
+
+    With the MLP, pictures are flattened.
+    """
+    alone = [picture_alone(spaces, picture) for picture in spaces.pictures]
+    of_pictures = config
+    if config.network == "mlp":
+        of_pictures = dataclasses.replace(config, hidden=())
+    pictures = [make_trunk(of_pictures, one) for one in alone]
+    mlp = make_trunk(dataclasses.replace(config, network="mlp"), spaces._replace(pictures=()))
+    return partial(_named, partial(Combined, pictures, mlp))
 
 
 def _named(make: Callable[..., nn.Module], name: str, parent: nn.Module | None) -> nn.Module:
@@ -130,7 +150,7 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         0 if config.auxiliary == "none" else math.prod(spaces.observation_shape),
         noise,
     )
-    example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
+    example = seen_of(spaces, jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype))
     variables = jax.eval_shape(network.init, jax.random.key(0), example)
     check_collections(config, variables)
     unravel = _unraveler(variables)
@@ -139,7 +159,8 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
         return ravel_pytree(network.init(key, example))[0]
 
     def apply(params: Array, observation: Array) -> PolicyOutput:
-        return network.apply(unravel(params), observation)
+        output = network.apply(unravel(params), seen_of(spaces, observation))
+        return output._replace(policy=valid_logits(spaces, observation, output.policy))
 
     if noise is None:
 

@@ -80,6 +80,7 @@ class Collecting(NamedTuple):
     policy: Policy
     filter: StepFilter | None
     any_member: Callable[[Array], Array]  # see `jax_env.advance`
+    normalized: int  # numbers of an observation, the first, that have running moments
 
 
 class _Row(NamedTuple):
@@ -115,7 +116,7 @@ def start(parts: Collecting, key: Array) -> CollectState:
     envs = begin(parts.env, key, config.envs, cached=config.reset == "cached")
     moments: Any = ()
     if config.normalize_observations:
-        moments = _first_moments(envs.observation.shape[-1])
+        moments = _first_moments(parts.normalized)
         moments = update_long_moments(moments, envs.observation, jnp.ones(config.envs, bool))
     zeros = jnp.zeros(config.envs, jnp.float32)
     return CollectState(envs, moments, _first_moments(1), zeros, zeros, zeros.astype(jnp.int32))

@@ -95,9 +95,9 @@ class HostCollector:
         )
 
     def _observation_moments(self) -> ObservationMoments | None:
-        if not self._config.normalize_observations or self._spaces.observation_kind != "vector":
+        size = self._spaces.normalized
+        if not self._config.normalize_observations or not size:
             return None
-        size = self._spaces.observation_shape[0]
         return ObservationMoments(self._shape[0], size, self._config.clip_observations)
 
     def _allocate(self) -> Any:

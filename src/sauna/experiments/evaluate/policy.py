@@ -57,7 +57,7 @@ class TrainedPolicy(FrozenPolicy):
         params = flat_params(self.policy, example, under("params/", own))
         moments = None
         if config.normalize_observations:
-            size = artifact.spaces.observation_shape
+            size = (artifact.spaces.normalized,)
             parts = {"mean": size, "variance": size, "count": (1,)}
             moments = Moments(
                 **{
@@ -86,6 +86,7 @@ class TrainedPolicy(FrozenPolicy):
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = False,
+        action_masks: Any = None,
     ) -> tuple[Any, None]:
         """The same with the arguments, the default and the answer of Stable-Baselines3's `predict`.
 
@@ -94,6 +95,7 @@ class TrainedPolicy(FrozenPolicy):
         Args:
           state: of recurrent policies, which there are none of; not read.
           episode_start: likewise.
+          action_masks: of the valid actions, as sb3-contrib's `MaskablePPO.predict` takes them.
 
         Returns:
           `(action, None)`.
@@ -103,7 +105,8 @@ class TrainedPolicy(FrozenPolicy):
         """
         key = jax.random.fold_in(jax.random.key(0), self._calls)
         self._calls += 1
-        return self(observation, deterministic=deterministic, key=key), None
+        how: dict[str, Any] = {"deterministic": deterministic, "action_mask": action_masks}
+        return self(observation, key=key, **how), None
 
     def heads(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V and the Vex head, `[L]` each, at what the network got `[L, *obs]`."""

@@ -133,7 +133,7 @@ def check_spaces(config: Config, spaces: Spaces) -> None:
     Raises:
       BadInput
     """
-    if spaces.observation_kind == "image":
+    if spaces.picture_shapes:
         raise BadInput(
             "measure: noise keeps rollouts of observations in memory, which images are too large "
             "for"

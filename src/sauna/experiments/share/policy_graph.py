@@ -72,6 +72,10 @@ def _check(config: Config, spaces: Spaces) -> None:
         unknown = "layer_norm"
     elif spaces.observation_kind not in ("vector", "one_hot", "image"):
         unknown = f"observations of kind {spaces.observation_kind}"
+    elif config.action_mask:
+        unknown = "action_mask"
+    elif spaces.pictures:
+        unknown = "pictures beside other observations"
     if unknown:
         raise BadInput(f"export: not written as ONNX or numpy: {unknown}")
 

@@ -77,7 +77,8 @@ def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, any_member: Any)
       any_member: see `jax_env.advance`.
     """
     policy = make_policy(config, spaces)
-    collecting = Collecting(config, env, policy, make_filter(config), any_member)
+    rule = make_filter(config)
+    collecting = Collecting(config, env, policy, rule, any_member, spaces.normalized)
     return IterationParts(config, collecting, policy, make_parts(config, policy, spaces))
 
 
