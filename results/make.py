@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from clone_page import clone_text
 from measured_pages import noise_page, posture_page, sweep_page
 from selection_page import CURVES as SELECTION_CURVES
 from selection_page import POINTS as SELECTION_POINTS
@@ -173,6 +174,9 @@ def write_pages() -> None:
     if results := load("fig3"):
         readmes_picture(results)
         (PAGES / "ppo.md").write_text(ppo_page(results))
+    if clones := load("clone"):
+        text = clone_text(clones["tasks"])
+        insert(ROOT / "docs" / "how-to" / "record_and_clone.md", "clone", text)
     if results := load("pong"):
         insert(ROOT / "docs" / "how-to" / "atari.md", "pong", pong_text(results))
 

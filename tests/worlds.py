@@ -6,7 +6,7 @@ import itertools
 import os
 import signal
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -137,6 +137,23 @@ class Scripted(World):
 
     def truncated(self) -> bool:
         return self.cut and self.t >= self.end
+
+
+class Boxed(Scripted):
+    """Actions in a box that is not [-1, 1]; notes what it gets."""
+
+    action_space = spaces.Box(-3.0, 1.0, (2,), np.float32)
+    seen_actions: ClassVar[list[np.ndarray]] = []
+
+    def reward(self, action: Any) -> float:
+        self.seen_actions.append(np.array(action))
+        return super().reward(action)
+
+
+class Unbounded(Scripted):
+    """Actions with one bound missing."""
+
+    action_space = spaces.Box(np.array([-1.0, -1.0]), np.array([1.0, np.inf]), dtype=np.float64)
 
 
 class Informative(Scripted):

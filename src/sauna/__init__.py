@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from sauna.envs.device.contract import JaxEnv, Transition
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
+    from sauna.experiments.record import record
+    from sauna.experiments.share.export import export
     from sauna.system.errors import BadInput, SaunaError
     from sauna.training.tracking.tracker import TrackedRun, Tracker
 
@@ -50,8 +52,10 @@ __all__ = [
     "VexTarget",
     "compare",
     "evaluate",
+    "export",
     "inspect",
     "load",
+    "record",
     "resume",
     "train",
 ]
@@ -69,7 +73,9 @@ _HOMES = {
     "TrackedRun": "sauna.training.tracking.tracker",
     "Tracker": "sauna.training.tracking.tracker",
     "evaluate": "sauna.experiments.evaluate.episodes",
+    "export": "sauna.experiments.share.export",
     "inspect": "sauna.experiments.inspect.command",
+    "record": "sauna.experiments.record",
     **dict.fromkeys(
         (
             "Choice",

@@ -269,7 +269,7 @@ def load(
     The action is the most likely one; `policy(observation, deterministic=False, key=...)` samples.
 
     Args:
-      path: the run directory.
+      path: the run directory; or an exported policy: its folder, `zoo:NAME`, `hf:USER/NAME`.
       member: name (`sauna/0`) or index.
       checkpoint: the iteration of a kept checkpoint; default the newest good one.
       best: as it was at its best evaluation during training (`eval_every`).
@@ -278,14 +278,16 @@ def load(
     """
     from sauna.experiments.evaluate.policy import TrainedPolicy
     from sauna.training.artifact import load_artifact
+    from sauna.training.located import locate
 
-    artifact = load_artifact(Path(path), iteration=checkpoint, trust=trust)
-    provide(Path(path), parts, PARTS)
+    folder = locate(path).folder
+    artifact = load_artifact(folder, iteration=checkpoint, trust=trust)
+    provide(folder, parts, PARTS)
     return TrainedPolicy(artifact, member, best=best)
 
 
 def _named(name: str, value: Any) -> Any:
     """Names a part that was passed by value; other values stay."""
-    if name == "track" and value is not None and not isinstance(value, str):
+    if name in ("track", "wrap") and value is not None and not isinstance(value, str):
         return [name_of(one) for one in (value if isinstance(value, list | tuple) else [value])]
     return name_of(value) if name in PARTS and value is not None else value

@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | plot | runs | study | ...`.
+"""The command line: `sauna train | resume | eval | inspect | compare | tune | plot | runs | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -28,6 +28,8 @@ from sauna.config.presets import (
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.evaluate import MAX_STEPS
+from sauna.experiments.share import flags as sharing
+from sauna.experiments.tune.flags import add_tune, tune_from_flags
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
@@ -96,14 +98,22 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--member", help="name (sauna/0) or index; default: all")
     evaluate.add_argument("--episodes", default="10", help="episodes per member (default 10)")
-    evaluate.add_argument("--env", help="another environment with the same spaces")
-    text = "keyword arguments of the environment, as a JSON object; they change the run's own"
-    evaluate.add_argument("--env-kwargs", metavar="JSON", help=text)
-    text = "the iteration of a kept checkpoint (default: the newest)"
-    evaluate.add_argument("--checkpoint", metavar="N", help=text)
-    text = "each member as it was at its best evaluation during training"
-    evaluate.add_argument("--best", action="store_true", help=text)
     evaluate.add_argument("--video", action="store_true", help="record the first episode")
+
+    text = "write episodes of a trained policy as data: a Minari dataset or a Parquet file"
+    record = commands.add_parser("record", help=text, allow_abbrev=False)
+    record.add_argument("--member", help="name (sauna/0) or index; default: the first")
+    record.add_argument("--episodes", default="100", help="how many (default 100)")
+    text = "minari:NAME, minari:./FOLDER/NAME or FILE.parquet"
+    record.add_argument("--to", required=True, metavar="DATA", help=text)
+    for command in (evaluate, record):
+        command.add_argument("--env", help="another environment with the same spaces")
+        text = "keyword arguments of the environment, as a JSON object; they change the run's own"
+        command.add_argument("--env-kwargs", metavar="JSON", help=text)
+        text = "the iteration of a kept checkpoint (default: the newest)"
+        command.add_argument("--checkpoint", metavar="N", help=text)
+        text = "each member as it was at its best evaluation during training"
+        command.add_argument("--best", action="store_true", help=text)
 
     text = "one page: an episode, what the Vex head says of it, what the filter drops"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
@@ -112,7 +122,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "the page (default: RUN/inspect_MEMBER_MODE.html)"
     inspect.add_argument("--out", metavar="PAGE", help=text)
     text = f"env steps after which an episode is cut (default {MAX_STEPS})"
-    for command in (evaluate, inspect):
+    for command in (evaluate, record, inspect):
         command.add_argument("run", metavar="RUN", help="run directory")
         command.add_argument("--max-steps", metavar="N", default=str(MAX_STEPS), help=text)
         most_likely = "the most likely action (default: sampled, as in training)"
@@ -141,13 +151,15 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     study = commands.add_parser("study", help=text, allow_abbrev=False)
     study.add_argument("study", metavar="NAME|FILE", help="see `sauna list studies`")
     text = "run the code that the file or run names, even if another user named it"
-    for command in (train, resume, evaluate, inspect, study):
+    for command in (train, resume, evaluate, record, inspect, study):
         command.add_argument("--trust", action="store_true", help=text)
     resume.add_argument("--accept-changed-code", **_PLACE["accept_changed_code"])
     for command in (compare, study):
         place = command.add_argument_group("where it trains")
         for name, how in _PLACE.items():
             place.add_argument(flag(name), **how)
+
+    add_tune(commands, values, _PLACE)
 
     text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
     plot = commands.add_parser("plot", help=text, allow_abbrev=False)
@@ -179,6 +191,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     bench.add_argument("--json", metavar="FILE", help="also write the figures there")
     own = ("env", "steps", "out")
     add_fields(bench, [n for n in FIELDS if n not in own], {**values, "seeds": 6})
+
+    sharing.add_commands(commands)
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
     lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
@@ -314,14 +328,23 @@ def _eval(values: dict[str, Any]) -> None:
         print(f"video: {result['video']}")
 
 
+def _record(values: dict[str, Any]) -> None:
+    run = Path(values.pop("run"))
+    _set_up_playing(values)
+    from sauna.experiments.record import record, report
+
+    print(report(record(run, **values, say=_say)))
+
+
 def _set_up_playing(values: dict[str, Any]) -> None:
-    """Reads the numbers of `eval` and `inspect`, and keeps JAX to one thread of the CPU."""
+    """Reads the numbers of what plays episodes, and keeps JAX to one thread of the CPU."""
     least = {"episodes": 1, "seed": 0, "max_steps": 1}
     if values.get("checkpoint") is not None:
         least["checkpoint"] = 0
     values |= {name: whole_number(values, name, number) for name, number in least.items()}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
+    os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "0")  # a step waits for each action
 
 
 def _inspect(values: dict[str, Any]) -> None:
@@ -410,11 +433,14 @@ _COMMANDS = {
     "train": _train,
     "resume": _resume,
     "eval": _eval,
+    "record": _record,
     "inspect": _inspect,
     "compare": _compare,
+    "tune": lambda values: tune_from_flags(values, _say),
     "plot": _plot,
     "runs": _runs,
     "study": _study,
     "bench": _bench,
     "list": _list,
+    **sharing.COMMANDS,
 }

@@ -14,7 +14,14 @@ from sauna.config.presets import resolve
 from sauna.config.settings import to_json
 from sauna.config.stored import stored_config
 from sauna.envs.device.contract import _reader, _writer
-from sauna.envs.spaces import action_writer, board_of, describe, observation_reader, read_spaces
+from sauna.envs.spaces import (
+    action_reader,
+    action_writer,
+    board_of,
+    describe,
+    observation_reader,
+    read_spaces,
+)
 from sauna.system.errors import BadInput
 
 TWO = gym.Discrete(2)
@@ -140,3 +147,35 @@ def test_mujoco_and_stored_runs_keep_what_was_done_before() -> None:
     assert stored_config(stored).rescale_actions
     del stored["rescale_actions"]
     assert not stored_config(stored).rescale_actions
+
+
+@pytest.mark.parametrize("rescale", [False, True])
+@pytest.mark.parametrize(
+    "space, actions",
+    [
+        (gym.Box(-2.0, 6.0, (2,), np.float32), np.array([[0.25, -1.0], [1.0, 0.5]], np.float32)),
+        (gym.Box(-np.inf, np.inf, (2, 1)), np.array([[30.0, -4.0]], np.float32)),
+        (gym.Discrete(3, start=-1), np.array([[0], [2]])),
+        (gym.MultiDiscrete([2, 3], start=[1, 4]), np.array([[1, 2], [0, 0]])),
+        (gym.MultiBinary(3), np.array([[1, 0, 1]])),
+    ],
+)
+def test_what_an_environment_took_is_read_back_as_the_network_gave_it(
+    space, actions, rescale
+) -> None:
+    write, read = action_writer(space, rescale), action_reader(space, rescale)
+    taken = np.stack([np.asarray(write(action)) for action in actions])
+    np.testing.assert_allclose(read(taken), actions, rtol=1e-6)
+
+
+def test_choices_that_a_space_does_not_have_are_refused() -> None:
+    for space, taken in (
+        (gym.Discrete(3, start=2), [1]),
+        (gym.Discrete(3), [3]),
+        (gym.Discrete(3), [0.5]),
+        (gym.MultiDiscrete([2, 2]), [[0, 2]]),
+        (gym.MultiDiscrete([2, 2]), [[0, 1, 1]]),
+        (gym.MultiBinary(2), [[0, 2]]),
+    ):
+        with pytest.raises(ValueError, match="its actions are none of"):
+            action_reader(space)(np.array(taken))

@@ -17,7 +17,8 @@ from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
-from sauna.training.initial import Source, _reward_moments, _source_of, read_initial
+from sauna.training.artifact import _reward_moments
+from sauna.training.initial import Source, _source_of, read_initial
 from sauna.training.prepare import prepare
 from threads import trained_here
 

@@ -38,7 +38,7 @@ class Rollout(NamedTuple):
     """
 
     observation: Array  # [S, N, ...] normalised float32, or uint8 images
-    action: Array  # [S, N, A] float32 (continuous, unclipped) or int32
+    action: Array  # [S, N, A] float32 (unclipped, or before the tanh of a bounded one) or int32
     log_prob: Array  # [S, N] float32
     reward: Array  # [S, N] float32, normalised
     value: Array  # [S, N] float32, V(s_t) at collection
@@ -159,6 +159,7 @@ class SamplerSetup(NamedTuple):
     action_kind: str
     action_sizes: tuple[int, ...]
     replay_rollouts: int = 0
+    distribution: str = "gaussian"  # of continuous actions
 
     @property
     def rows(self) -> int:

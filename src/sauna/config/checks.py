@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -109,6 +110,22 @@ def check_consistent(config: Config) -> None:
     check_rules(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
+    for path in config.wrap:
+        check_wrapper(path)
+
+
+def check_wrapper(path: str) -> None:
+    """Refuses a wrapper that no worker could import and call.
+
+    Raises:
+      BadInput: it is none; naming it.
+    """
+    if ":" not in path:
+        raise BadInput(f"wrap: {path!r} is no module:function")
+    if is_local(path):
+        raise BadInput("wrap: a wrapper has to be importable; put it at the top level of a module")
+    if not callable(import_name("wrap", path)):
+        raise BadInput(f"wrap: {path} cannot be called with an environment")
 
 
 def check_rate(config: Config) -> None:
@@ -156,6 +173,7 @@ def check_rules(config: Config) -> None:
             if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
                 raise BadInput(f"{name}: needs gae_over=all")
     check_passes(config)
+    check_distribution(config)
     if config.replay_rollouts:
         check_replay(config)
     if config.normalize_over == "kept" and config.sampler == "none":
@@ -164,6 +182,25 @@ def check_rules(config: Config) -> None:
         raise BadInput(
             "objective: unclipped needs a stop rule (espo) or a loss_weight "
             "(sample-dropout): nothing else bounds the ratio"
+        )
+
+
+def check_distribution(config: Config) -> None:
+    """Refuses rules that need a formula which the actions' distribution lacks.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.distribution == "gsde" and config.sampler == "gradient-norm":
+        raise BadInput(
+            "sampler: gradient-norm has no formula for the gradient of distribution gsde; it has "
+            "one for gaussian, squashed and beta"
+        )
+    whole = json.loads(config.loss_weight_kwargs).get("on") == "all"
+    if config.distribution == "beta" and config.loss_weight == "delight" and not whole:
+        raise BadInput(
+            "loss_weight: delight weighs the gradient of the mean, which distribution beta has "
+            'no parameter for; loss_weight_kwargs {"on": "all"} weighs it whole'
         )
 
 

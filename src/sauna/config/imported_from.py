@@ -48,6 +48,8 @@ def names_the_folder(open_run: F) -> F:
         except NotFound as error:
             from sauna.system import run_directory  # which Windows cannot import
 
+            if not (run / "config.json").exists():  # an exported policy does not know
+                raise
             folders = run_directory.read_config(run, needed=()).get(KEY)
             folder = folders.get(error.module) if isinstance(folders, dict) else None
             if not isinstance(folder, str):

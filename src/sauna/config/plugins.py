@@ -123,7 +123,7 @@ def provide(run: Path, given: Mapping[str, Any], parts: Sequence[str]) -> dict[s
     """
     from sauna.system import run_directory  # which Windows cannot import
 
-    config = run_directory.read_config(run).get("config", {})
+    config = run_directory.read_config(run, exported=True).get("config", {})
     for name in parts:
         path = str(config.get(name))
         if is_local(path):

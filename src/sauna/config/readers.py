@@ -5,6 +5,8 @@ Of a `Config`, or of an environment's `Spaces` for `needs_spaces`; see `fields.o
 
 from __future__ import annotations
 
+from sauna.config.choices import BOUNDED
+
 ON_HOST = ("environments on the host", lambda c: c.backend != "device")
 WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
 TRACKED = ("track", lambda c: c.track != ("none",))
@@ -23,6 +25,12 @@ VALUE_MLP = (
     lambda c: c.network in ("auto", "mlp") and c.trunk == "separate",
 )
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
+LOG_STD = ("a distribution other than beta", lambda c: c.distribution != "beta")
+GSDE = ("distribution gsde", lambda c: c.distribution == "gsde")
+UNBOUNDED = (
+    "distribution gaussian or gsde: the others are stretched to the bounds by themselves",
+    lambda c: c.distribution not in BOUNDED,
+)
 VECTORS = (
     "vector observations: others have no running moments",
     lambda spaces: spaces.observation_kind == "vector",
@@ -72,4 +80,6 @@ SCHEDULED = (
 )
 EVALUATED = ("eval_every above 0", lambda c: c.eval_every > 0)
 FINE_TUNED = ("init_from", lambda c: bool(c.init_from))
+DATA = "data:"  # before recorded episodes that init_from names
+CLONED = ("init_from data:...", lambda c: c.init_from.startswith(DATA))
 AUXILIARY = ("an auxiliary head", lambda c: c.auxiliary != "none")

@@ -29,6 +29,14 @@ class RunOptions:
         decided_by_study=True,
     )
     env_kwargs: str = _task("{}", "keyword arguments of the environment, as a JSON object")
+    wrap: tuple[str, ...] = _task(
+        (),
+        "module:function, ...: each takes an environment and gives one, the first the innermost",
+        read_when=readers.ON_HOST,
+    )
+    stack: int = _task(
+        1, "how many of the last observations, as vectors, are shown as one", at_least=1
+    )
     arm: tuple[str, ...] = _run(
         ("ppo",), "what to train, a name or several: see `sauna list arms`", common=True
     )
@@ -152,7 +160,8 @@ class RunOptions:
     init_from: str = _run(
         "",
         "start from the weights of a trained run: RUN, or RUN/ARM/SEED for one member of it; with "
-        "/best behind it, as of its best evaluation",
+        "/best behind it, as of its best evaluation; or from a clone of recorded episodes: "
+        "data:FILE.parquet, data:minari:NAME",
     )
     init_normalizer: str = _run(
         "observations",
@@ -160,6 +169,15 @@ class RunOptions:
         "observations alone, or none (fresh)",
         choices=("kept", "observations", "fresh"),
         read_when=readers.FINE_TUNED,
+    )
+    clone_epochs: int = _run(
+        20,
+        "passes over recorded episodes before training begins",
+        at_least=1,
+        read_when=readers.CLONED,
+    )
+    clone_learning_rate: float = _run(
+        1e-3, "Adam's step size in these passes", above=0, read_when=readers.CLONED
     )
 
     eval_every: int = _evaluation(

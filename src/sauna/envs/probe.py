@@ -12,6 +12,7 @@ from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
 from sauna.envs.shapes import check_shapes
 from sauna.envs.spaces import Spaces, describe, observation_reader
+from sauna.envs.wrapping import PLAIN, Wrapping, wrapped_space
 from sauna.system.errors import BadInput, one_line
 
 STEPS = 25
@@ -33,7 +34,7 @@ class Probe(NamedTuple):
     group: int | None = None
 
 
-def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
+def probe(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Probe:
     """Makes the environment twice and plays the same seed and actions in both.
 
     One of the two has played another episode before, so that a state which survives a reset is
@@ -42,7 +43,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     Raises:
       BadInput: the environment cannot be made or played, or its spaces are not supported.
     """
-    first, second = make_env(env, env_kwargs), make_env(env, env_kwargs)
+    first, second = (make_env(env, env_kwargs, wrapping) for _ in range(2))
     try:
         spaces = describe(first.observation_space, first.action_space)
         limit = getattr(getattr(first, "spec", None), "max_episode_steps", None)
@@ -61,7 +62,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     return Probe(spaces, differs, limit if isinstance(limit, int) else None, group)
 
 
-def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
+def probe_on_device(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Probe:
     """The spaces of an environment on the device, which repeats itself by construction.
 
     Raises:
@@ -71,13 +72,13 @@ def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
     from sauna.envs.device.make import make_jax_env
 
     made = make_jax_env(env, env_kwargs)
-    spaces = describe(made.observation_space, made.action_space)
+    spaces = describe(wrapped_space(made, wrapping), made.action_space)
     if ":" in env:
-        _check_traced(env, made, spaces)
+        _check_traced(env, made, spaces, wrapping)
     return Probe(spaces, None)
 
 
-def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
+def _check_traced(env: str, made: Any, spaces: Spaces, wrapping: Wrapping) -> None:
     """Traces a reset and a step, which compiles and computes nothing.
 
     Raises:
@@ -86,8 +87,9 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
     import jax
 
     from sauna.envs.device.contract import flat
+    from sauna.envs.device.stacked import stacked
 
-    one = flat(_with_checked_shapes(made))
+    one = flat(stacked(_with_checked_shapes(made), wrapping.stack))
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
     try:
         state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))

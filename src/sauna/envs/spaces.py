@@ -27,6 +27,7 @@ class Spaces(NamedTuple):
     observation_structure: Any
     action_structure: Any
     observation_high: float = 255.0  # of an image's bytes: the networks here divide by it
+    action_bounded: bool = True  # whether each component of a continuous action has both bounds
 
     @property
     def observation_dtype(self) -> Any:
@@ -69,6 +70,8 @@ def difference(before: Spaces, now: Spaces) -> str:
     """
     for name in Spaces._fields:
         old, new = getattr(before, name), getattr(now, name)
+        if name == "action_bounded":
+            continue
         if name.endswith("structure") and not (isinstance(old, tuple) and isinstance(new, tuple)):
             continue  # text, of 0.1.0
         if old != new:
@@ -112,7 +115,8 @@ def describe(observation_space: Any, action_space: Any) -> Spaces:
     high = float(observation_space.high.max(initial=0)) if kind == "image" else 0.0
     action_kind, sizes = _describe_action(action_space)
     parts = _structure(observation_space), _structure(action_space)
-    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0)
+    bounded = action_kind != "continuous" or bool(bounded_components(action_space).all())
+    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0, bounded)
 
 
 def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
@@ -286,6 +290,40 @@ def _box_writer(space: Any, rescale: bool) -> Callable[[np.ndarray], Any]:
     return chosen if len(shape) == 1 else lambda action: chosen(action).reshape(shape)
 
 
+def action_reader(space: Any, rescale: bool = False) -> Callable[[Any], np.ndarray]:
+    """A function from actions that `env.step` took `[L, ...]` to the network's `[L, A]`.
+
+    It is the inverse of `action_writer`; what that has clipped stays at the bound. It raises
+    `ValueError` for a choice that the space does not have.
+    """
+    from gymnasium import spaces as gym
+
+    if isinstance(space, gym.Box):
+        stretched = stretch(space) if rescale else None
+
+        def read(actions: Any) -> np.ndarray:
+            flat = np.asarray(actions, np.float64).reshape(len(actions), -1)
+            if stretched is None or flat.shape[1:] != stretched[0].shape:
+                return flat
+            bounded, center, half = stretched
+            return np.where(bounded, (flat - center) / half, flat)
+
+        return read
+    _, sizes = _describe_action(space)
+    choices = np.full(sizes, 2) if isinstance(space, gym.MultiBinary) else np.array(sizes)
+    start = np.asarray(getattr(space, "start", 0))
+
+    def read_choices(actions: Any) -> np.ndarray:
+        found = np.asarray(actions).reshape(len(actions), -1)
+        fits = found.shape[1] == choices.size and found.dtype.kind in "iub"
+        chosen = found.astype(np.int64) - start if fits else found
+        if not fits or ((chosen < 0) | (chosen >= choices)).any():
+            raise ValueError(f"its actions are none of {' '.join(str(space).split())}")
+        return chosen
+
+    return read_choices
+
+
 def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """How [-1, 1] is stretched to a box: `center + half * action` where `bounded`, all `[A]`.
 
@@ -295,9 +333,15 @@ def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
       `(bounded, center, half)`, or None where nothing would change.
     """
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
-    bounded = (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)
+    bounded = bounded_components(space)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     center, half = (low + high) / 2, (high - low) / 2
     if np.all(center == 0.0) and np.all(half == 1.0):
         return None
     return bounded, center, half
+
+
+def bounded_components(space: Any) -> np.ndarray:
+    """Which components `[A]` of a box of actions have both bounds."""
+    low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+    return (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)

@@ -164,13 +164,26 @@ def load_checkpoint(
         manifest = _manifest(path)
         if check is not None:
             check(manifest)
-        blob = read_file(path / "state.safetensors", min(manifest["bytes"], LARGEST))
-        if hashlib.sha256(blob).hexdigest() != manifest["sha256"]:
-            raise Untrusted("state.safetensors is not what was written (SHA-256 differs)")
-        check_header(blob)
-        return Checkpoint(path, manifest, load(blob))
-    except (Untrusted, SafetensorError, KeyError) as error:  # KeyError: a type that numpy lacks
+        state = path / "state.safetensors"
+        return Checkpoint(path, manifest, load_arrays(state, manifest["bytes"], manifest["sha256"]))
+    except Untrusted as error:
         raise BadCheckpoint(f"{path}: {error}") from error
+
+
+def load_arrays(path: Path, size: int, sha256: str) -> dict[str, np.ndarray]:
+    """The arrays of a safetensors file of known size and digest.
+
+    Raises:
+      Untrusted: its bytes are not those, or no such file.
+    """
+    blob = read_file(path, min(size, LARGEST))
+    if hashlib.sha256(blob).hexdigest() != sha256:
+        raise Untrusted(f"{path.name} is not what was written (SHA-256 differs)")
+    check_header(blob)
+    try:
+        return load(blob)
+    except (SafetensorError, KeyError) as error:  # KeyError: a type that numpy lacks
+        raise Untrusted(str(error)) from error
 
 
 def read_manifest(path: Path) -> dict[str, Any]:

@@ -47,6 +47,7 @@ _PARTS: dict[str, type] = {
     "extended": list,
 }
 INITIAL = "init"  # the folder of what a run starts from
+EXPORTED = "policy.json"  # of a folder that holds an exported policy in place of a run
 _PACKAGES = ("sauna-rl", "jax", "jaxlib", "flax", "optax", "gymnasium", "mujoco", "numpy")
 
 
@@ -173,14 +174,24 @@ def write_json(path: Path, value: Any) -> None:
     replace_file(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_config(run: Path, needed: tuple[str, ...] = ("config", "spaces")) -> dict[str, Any]:
+def read_config(
+    run: Path, needed: tuple[str, ...] = ("config", "spaces"), exported: bool = False
+) -> dict[str, Any]:
     """`config.json` of a run: what is `needed` is there, and what is there is of its type.
+
+    Args:
+      exported: a policy that was exported will do; then it is `policy.json`.
 
     Raises:
       BadInput: there is no run, or its config is not one.
     """
-    path = run / "config.json"
+    path = run / (EXPORTED if exported and is_exported(run) else "config.json")
     if not os.path.lexists(path):
+        if is_exported(run):
+            raise BadInput(
+                f"{run} is an exported policy, and no run: it can be played (sauna eval) and "
+                f"trained further (--init-from)"
+            )
         raise BadInput(f"{run} is not a run directory (it has no config.json)")
     stored = _read(path)
     for name, kind in _PARTS.items():
@@ -189,6 +200,11 @@ def read_config(run: Path, needed: tuple[str, ...] = ("config", "spaces")) -> di
             noun = "a table" if kind is dict else "a list"
             raise BadInput(f"config: {path}: {name} is missing or is not {noun}")
     return stored
+
+
+def is_exported(folder: Path) -> bool:
+    """Whether a folder holds an exported policy, and no run."""
+    return os.path.lexists(folder / EXPORTED) and not os.path.lexists(folder / "config.json")
 
 
 def write_config(run: Path, stored: Mapping[str, Any]) -> None:

@@ -1,19 +1,29 @@
-"""What a finished run offers: its newest good checkpoint and what that is of. No JAX here."""
+"""What a finished run offers: its newest good checkpoint and what that is of. No JAX here.
+
+An exported policy offers the same: it is one member's part of one checkpoint.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from sauna.config.presets import RunConfig
 from sauna.config.settings import Config
 from sauna.config.stored import read_stored
 from sauna.config.trust import check_trusted
 from sauna.envs.spaces import Spaces, describe, difference, read_spaces
+from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
 from sauna.system.logs import check_logs
+from sauna.system.safe_read import Untrusted
+
+STATE = "policy.safetensors"  # of an exported policy
+EXPORT_FORMAT = 1
 
 
 class Artifact(NamedTuple):
@@ -29,6 +39,11 @@ class Artifact(NamedTuple):
         """What all members share."""
         return self.run.config
 
+    @property
+    def is_exported(self) -> bool:
+        """Whether it is one policy alone, and no run."""
+        return run_directory.is_exported(self.checkpoint.path)
+
 
 def load_artifact(
     run: Path,
@@ -36,14 +51,18 @@ def load_artifact(
     iteration: int | None = None,
     trust: bool = False,
 ) -> Artifact:
-    """Reads a run's newest good checkpoint, or the one of an iteration.
+    """Reads a run's newest good checkpoint, or the one of an iteration; or an exported policy.
 
     Raises:
       BadInput: no run there, no checkpoint yet, none of that iteration, or one that names code of
         somebody else's, which `trust` allows.
       BadCheckpoint: none of its checkpoints can be trusted.
     """
-    stored = run_directory.read_config(run, needed=())
+    stored = run_directory.read_config(run, needed=(), exported=True)
+    if run_directory.is_exported(run):
+        if iteration is not None:
+            raise BadInput(f"checkpoint: {run} is an exported policy, which has one alone")
+        return _artifact(_exported(run, stored), stored, trust)
     kept = [int(path.name) for path in checkpoint.numbered(run / "checkpoints")]
     if iteration is None:
         loaded = _newest(run, warn)
@@ -54,6 +73,16 @@ def load_artifact(
         loaded = checkpoint.load_checkpoint(run / "checkpoints" / f"{iteration:08d}")
     if loaded is None:
         raise BadInput(f"{run} has no checkpoint yet")
+    return _artifact(loaded, stored, trust)
+
+
+def _artifact(loaded: checkpoint.Checkpoint, stored: Mapping[str, Any], trust: bool) -> Artifact:
+    """Reads what a checkpoint is of; `stored` carries the seal.
+
+    Raises:
+      BadInput: it names code of somebody else's.
+      BadCheckpoint: it cannot be trusted.
+    """
     check_trusted(loaded.manifest, str(loaded.path), stored.get("seal"), trust)
     try:
         spaces = read_spaces(loaded.manifest["spaces"])
@@ -63,6 +92,30 @@ def load_artifact(
     if not members or len(set(members)) < len(members):
         raise checkpoint.BadCheckpoint(f"{loaded.path}: its members are not named, each once")
     return Artifact(read_stored(loaded.manifest), spaces, members, loaded)
+
+
+def _exported(path: Path, stored: dict[str, Any]) -> checkpoint.Checkpoint:
+    """An exported policy as a checkpoint of one member.
+
+    Raises:
+      BadCheckpoint: a file is missing, cut short or changed.
+      NewerFormat: only a newer version can read it.
+    """
+    kinds = {"format": int, "iteration": int, "env_steps": int, "bytes": int, "sha256": str}
+    for name, kind in {**kinds, "members": list, "spaces": list}.items():
+        if type(stored.get(name)) is not kind:
+            raise checkpoint.BadCheckpoint(f"{path}: {name} is missing or of another type")
+    if stored["format"] > EXPORT_FORMAT:
+        raise checkpoint.NewerFormat(f"{path} is of a newer version of SAUNA")
+    if len(stored["members"]) != 1 or type(stored["members"][0]) is not str:
+        raise checkpoint.BadCheckpoint(f"{path}: it is not of one member")
+    state = path / STATE
+    try:
+        arrays = checkpoint.load_arrays(state, stored["bytes"], stored["sha256"])
+    except Untrusted as error:
+        raise checkpoint.BadCheckpoint(f"{path}: {error}") from error
+    named = {f"{stored['members'][0]}/{name}": array for name, array in arrays.items()}
+    return checkpoint.Checkpoint(path, stored, named)
 
 
 def _newest(run: Path, warn: Callable[[str], None]) -> checkpoint.Checkpoint | None:
@@ -88,8 +141,48 @@ def best_of(artifact: Artifact, member: str) -> dict[str, Any]:
       BadInput: it was not evaluated during training.
     """
     found = checkpoint.under(f"{member}/best/", artifact.checkpoint.arrays)
+    if not found and artifact.is_exported:
+        raise BadInput(
+            f"best: {artifact.checkpoint.path} is an exported policy, which is one alone"
+        )
     if not found:
         raise BadInput(f"best: {member} was not evaluated during training; see --eval-every")
+    return found
+
+
+def policy_arrays(
+    artifact: Artifact, name: str, best: bool, normalizer: str
+) -> dict[str, np.ndarray]:
+    """A member's parameters, and as much of its running statistics as is kept.
+
+    Args:
+      best: as they were at its best evaluation during training.
+      normalizer: whose statistics: of observations and rewards (kept), observations, or none
+        (fresh).
+
+    Raises:
+      BadInput: with `best`, it was not evaluated during training.
+    """
+    own = checkpoint.under(f"{name}/", artifact.checkpoint.arrays)
+    policy = best_of(artifact, name) if best else own
+    found = {key: a for key, a in policy.items() if key.startswith("params/")}
+    if normalizer != "fresh":
+        found |= {key: a for key, a in policy.items() if key.startswith("observation_moments/")}
+    if normalizer == "kept":
+        found |= _reward_moments(own)
+    return found
+
+
+def _reward_moments(own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The running moments of rewards in float64, as the host has them."""
+    found = {}
+    for part in ("mean", "variance", "count"):
+        name = f"reward_moments/{part}"
+        if name in own:
+            found[name] = own[name]
+        elif f"collect/{name}" in own:
+            lost = own.get(f"collect/{name}_lost", np.zeros(1))
+            found[name] = own[f"collect/{name}"].astype(np.float64) + lost
     return found
 
 
@@ -125,6 +218,7 @@ def check_spaces(artifact: Artifact, env: Any) -> None:
     Raises:
       BadInput: naming the space that differs.
     """
-    found = describe(env.observation_space, env.action_space)
+    space = wrapped_space(env, wrapping_of(artifact.config))
+    found = describe(space, env.action_space)
     if differs := difference(artifact.spaces, found):
         raise BadInput(f"env: has other spaces than the run: {differs}")

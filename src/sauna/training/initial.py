@@ -1,4 +1,4 @@
-"""Fine-tuning: the weights and the normaliser of a trained run, from which a new run starts.
+"""The weights and the normaliser from which a new run starts: of a trained run, or of a clone.
 
 They are copied into the new run's directory before it begins (`init/`), so that what becomes of the
 other run does not matter any more.
@@ -6,7 +6,7 @@ other run does not matter any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ from sauna.config.settings import Config
 from sauna.envs.spaces import difference
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
-from sauna.system.run_directory import INITIAL
-from sauna.training.artifact import Artifact, best_of, find_member, load_artifact
+from sauna.system.run_directory import INITIAL, is_exported
+from sauna.training.artifact import Artifact, find_member, load_artifact, policy_arrays
+from sauna.training.cloning import clone_members, is_data
 from sauna.training.prepare import Prepared
 
 # What has to be the same, beside the spaces, for weights to mean the same.
@@ -30,6 +31,8 @@ SHAPES = (
     "layer_norm",
     "value_hidden",
     "trunk",
+    "distribution",
+    "sde_expln",
     "rescale_actions",
     "normalize_observations",
 )
@@ -48,7 +51,7 @@ class Source:
 
 
 def _is_run(path: Path) -> bool:
-    return (path / "config.json").is_file()
+    return (path / "config.json").is_file() or is_exported(path)
 
 
 def read_initial(
@@ -61,11 +64,13 @@ def read_initial(
 
     Raises:
       BadInput: there is no such run or member, it is somebody else's and not trusted, or its spaces
-        or its network differ; the part is named.
+        or its network differ; the part is named. Or recorded episodes cannot be cloned.
     """
     config = prepared.config
     if not config.init_from:
         return None
+    if is_data(config.init_from):
+        return clone_members(prepared, say)
     source = Source(config.init_from)
     if not _is_run(source.run):
         raise BadInput(f"init_from: {config.init_from} is no run, and no RUN/ARM/SEED of one")
@@ -75,7 +80,7 @@ def read_initial(
     chosen = {}
     for member in prepared.members:
         chosen[member.name] = name = _source_of(member, artifact.members, source.member)
-        own = _arrays_of(artifact, name, source.best, config.init_normalizer)
+        own = policy_arrays(artifact, name, source.best, config.init_normalizer)
         arrays |= {f"{member.name}/{key}": array for key, array in own.items()}
     manifest = artifact.checkpoint.manifest
     origin = {
@@ -130,31 +135,6 @@ def _source_of(member: Member, known: list[str], named: str) -> str:
             f"RUN/{known[0]} (there are: {', '.join(known)})"
         )
     return f"{arm}/{member.seed}"
-
-
-def _arrays_of(artifact: Artifact, name: str, best: bool, normalizer: str) -> dict[str, np.ndarray]:
-    """A member's parameters, and as much of its running statistics as is kept."""
-    own = checkpoint.under(f"{name}/", artifact.checkpoint.arrays)
-    policy = best_of(artifact, name) if best else own
-    found = {key: a for key, a in policy.items() if key.startswith("params/")}
-    if normalizer != "fresh":
-        found |= {key: a for key, a in policy.items() if key.startswith("observation_moments/")}
-    if normalizer == "kept":
-        found |= _reward_moments(own)
-    return found
-
-
-def _reward_moments(own: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The running moments of rewards in float64, as the host has them."""
-    found = {}
-    for part in ("mean", "variance", "count"):
-        name = f"reward_moments/{part}"
-        if name in own:
-            found[name] = own[name]
-        elif f"collect/{name}" in own:
-            lost = own.get(f"collect/{name}_lost", np.zeros(1))
-            found[name] = own[f"collect/{name}"].astype(np.float64) + lost
-    return found
 
 
 def save_initial(run: Path, arrays: dict[str, np.ndarray], manifest: dict[str, Any]) -> None:

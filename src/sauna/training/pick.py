@@ -15,7 +15,7 @@ from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import look_at, place
 
 # What has to be known to look at an environment.
-LOOKED_AT = ("env", "env_kwargs", "backend", "device", "devices")
+LOOKED_AT = ("env", "env_kwargs", "wrap", "stack", "backend", "device", "devices")
 
 
 class Picked(NamedTuple):

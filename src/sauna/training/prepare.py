@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sauna.config.checks import check_read, check_read_here, local_parts, own_parts
+from sauna.config.choices import BOUNDED
 from sauna.config.presets import Member, RunConfig, parse_all, resolve_run
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
 from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.envs.spaces import PICTURES, SMALLEST_IMAGE, Spaces, board_of
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
 from sauna.training.loop.multihost import check_split, read_host_rank
@@ -146,12 +148,12 @@ def look_at(config: Config) -> Probe:
     """Learns what has to be known of the environment before a run starts."""
     kwargs = json.loads(config.env_kwargs)
     if config.backend != "device":
-        return probe(config.env, kwargs)
+        return probe(config.env, kwargs, wrapping_of(config))
     if local_parts(config):  # trained in this process
         configure_jax(config.devices if config.device == "cpu" else 0, config.device)
     else:
         configure_jax()
-    return probe_on_device(config.env, kwargs)
+    return probe_on_device(config.env, kwargs, wrapping_of(config))
 
 
 def check_writes(config: Config) -> None:
@@ -239,7 +241,7 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
     """Replaces what depends on the environment or the machine by what it comes to.
 
     Raises:
-      BadInput: the network does not fit the observations.
+      BadInput: the network does not fit the observations, or the distribution the actions.
     """
     config = run.config
     network = _network(config, spaces)
@@ -248,6 +250,11 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
         raise BadInput(
             f"auxiliary: an observation has {predicted:,} numbers; a head predicts at most "
             f"{MAX_PREDICTED:,}"
+        )
+    if config.distribution in BOUNDED and not spaces.action_bounded:
+        raise BadInput(
+            f"distribution: {config.distribution} needs bounds of every action; {config.env} has "
+            "components without (gaussian and gsde do not need them)"
         )
     number = len(run.members)
     processes = config.processes or os.cpu_count() or 1

@@ -78,6 +78,12 @@ ARMS = [
     ("sauna", {"threshold": 0.9}),
     ("sauna", {"threshold": 0.9, "dropped": "mask", "sign_rewards": True}),
     pytest.param("sauna", {"keep_rate_target": 0.6}, marks=slow),
+    pytest.param(
+        "sauna", {"threshold": 0.9, "distribution": "gsde", "sde_sample_freq": 5}, marks=slow
+    ),
+    pytest.param("ppo", {"distribution": "gsde", "sde_expln": True}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "distribution": "squashed"}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "distribution": "beta"}, marks=slow),
     pytest.param("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}, marks=slow),
     pytest.param(
         "sauna", {"threshold": 0.9, "reset": "cached", "normalize_rewards": False}, marks=slow

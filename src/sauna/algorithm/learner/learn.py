@@ -81,7 +81,7 @@ def learn(
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
         state.learning_rate if moves_rate(config) else jnp.float32(jnp.nan),
-        policy_std(parts.policy.unravel(state.params)),
+        policy_std(parts.policy.unravel(state.params), config.sde_expln),
         is_finite & jnp.all(jnp.isfinite(state.params)),
         work,
     )

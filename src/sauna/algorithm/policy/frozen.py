@@ -7,12 +7,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Array
 from sauna.config.settings import Config
 from sauna.envs.shapes import batch_size, one_of
 from sauna.envs.spaces import Spaces, action_writer, observation_reader
+from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system.errors import BadInput
 
 
@@ -29,9 +31,9 @@ class FrozenPolicy:
 
     def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
         self.config = config
-        self._space = env.observation_space
-        self._read = observation_reader(env.observation_space)
-        self.write = action_writer(env.action_space, config.rescale_actions)
+        self._space = wrapped_space(env, wrapping_of(config))
+        self._read = observation_reader(self._space)
+        self._write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
         self.policy: Policy = make_policy(config, spaces)
         self.params: Any = None
@@ -46,10 +48,11 @@ class FrozenPolicy:
 
     def _choose(self, params: Array, observation: Any, key: Any, *, deterministic: bool) -> Any:
         distribution = self.policy.distribution
-        parameters = self.policy.apply(params, observation).policy
+        output = self.policy.apply(params, observation)
         if deterministic:
-            return distribution.mode(parameters)
-        return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
+            return distribution.mode(output.policy)
+        noise = distribution.draw(key, output.policy.shape[:-1])
+        return self.policy.sample(params, output, noise)
 
     def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
         """The action for a raw observation, clipped or stretched as the environment wants it.
@@ -67,8 +70,12 @@ class FrozenPolicy:
             return np.stack([np.asarray(self.write(action)) for action in actions])
         return self.write(actions[0])
 
+    def write(self, action: np.ndarray) -> Any:
+        """What the environment takes of what the network chooses `[A]`."""
+        return self._write(to_env(self.policy.distribution, action))
+
     def act(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> np.ndarray:
-        """What the network chooses for one raw observation `[A]`, neither clipped nor stretched."""
+        """What the network chooses for one raw observation `[A]`, as a rollout holds it."""
         return self._choices(self._read(observation)[None], deterministic, key)[0]
 
     def _choices(self, rows: np.ndarray, deterministic: bool, key: Any) -> np.ndarray:

@@ -14,13 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from sauna.algorithm.policy.bounded import beta, squashed
 from sauna.algorithm.policy.distributions import (
     Distribution,
     bernoulli,
     gaussian,
     multi_categorical,
 )
-from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN
+from sauna.algorithm.policy.gsde import deviation, explore, gsde
+from sauna.algorithm.policy.networks import MLP, ActorCritic, NatureCNN, StateNoise
 from sauna.algorithm.policy.pictures import PICTURE_NETWORKS
 from sauna.algorithm.types import Array, Params, PolicyOutput
 from sauna.config.plugins import import_name
@@ -37,17 +39,23 @@ class Policy(NamedTuple):
       apply: `(params, observation [..., *obs]) -> PolicyOutput`.
       unravel: `params [D] -> the flax parameter pytree`.
       distribution: of the actions.
+      sample: `(params, output, noise [..., M]) -> action [..., A]`.
+      hold: env steps for which one draw of noise is kept.
     """
 
     init: Callable[[Array], Array]
     apply: Callable[[Array, Array], PolicyOutput]
     unravel: Callable[[Array], Params]
     distribution: Distribution
+    sample: Callable[[Array, PolicyOutput, Array], Array]
+    hold: int = 1
 
 
-def make_distribution(spaces: Spaces) -> Distribution:
+def make_distribution(config: Config, spaces: Spaces) -> Distribution:
     if spaces.action_kind == "continuous":
-        return gaussian(spaces.action_sizes[0])
+        size = spaces.action_sizes[0]
+        made = {"squashed": squashed, "beta": beta}.get(config.distribution, gaussian)
+        return made(size)
     if spaces.action_kind == "multi_binary":
         return bernoulli(spaces.action_sizes[0])
     return multi_categorical(spaces.action_sizes)
@@ -112,13 +120,15 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     Raises:
       BadInput: the network is none, or keeps more than parameters.
     """
-    distribution = make_distribution(spaces)
+    distribution = make_distribution(config, spaces)
+    noise = state_noise(config, spaces)
     network = ActorCritic(
         make_trunk(config, spaces),
         distribution.num_outputs,
         config.log_std_init if distribution.has_log_std else None,
         config.trunk == "shared",
         0 if config.auxiliary == "none" else math.prod(spaces.observation_shape),
+        noise,
     )
     example = jnp.zeros((1, *spaces.observation_shape), spaces.observation_dtype)
     variables = jax.eval_shape(network.init, jax.random.key(0), example)
@@ -131,7 +141,27 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     def apply(params: Array, observation: Array) -> PolicyOutput:
         return network.apply(unravel(params), observation)
 
-    return Policy(init, apply, unravel, distribution)
+    if noise is None:
+
+        def sample(params: Array, output: PolicyOutput, noise: Array) -> Array:
+            return distribution.sample(output.policy, noise)
+
+        return Policy(init, apply, unravel, distribution, sample)
+    features, size = variables["params"]["log_std"].shape
+
+    def explored(params: Array, output: PolicyOutput, matrix: Array) -> Array:
+        std = deviation(unravel(params)["params"]["log_std"], noise.expln)
+        return explore(output.policy[..., :size], output.hidden, std, matrix)
+
+    hold = config.sde_sample_freq or config.rollout_steps
+    return Policy(init, apply, unravel, gsde(size, features), explored, hold)
+
+
+def state_noise(config: Config, spaces: Spaces) -> StateNoise | None:
+    """Returns how the exploration depends on the state; None if it does not."""
+    if spaces.action_kind != "continuous" or config.distribution != "gsde":
+        return None
+    return StateNoise(config.sde_expln, config.sde_learn_features)
 
 
 def check_collections(config: Config, variables: Params) -> None:
@@ -150,7 +180,7 @@ def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Arra
     Args:
       observation: `[N, *obs]` normalised; noise: `[N, M]` from `distribution.draw`.
     """
-    return policy.distribution.sample(policy.apply(params, observation).policy, noise)
+    return policy.sample(params, policy.apply(params, observation), noise)
 
 
 def score(policy: Policy, params: Array, observation: Array, action: Array) -> Array:

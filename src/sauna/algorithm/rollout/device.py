@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import (
     LongMoments,
     initial_moments,
@@ -151,7 +152,8 @@ def collect(
     def step(carry: _Carry) -> tuple[_Carry, _Row]:
         acting = (carry.kept < config.rollout_steps) & (carry.t < limit)
         key = jax.random.fold_in(filter_key, carry.t)
-        return _step(parts, params, carry, noise[carry.t], acting, keys.env, key, hypers)
+        own = noise[_noise_row(parts, carry.t)]
+        return _step(parts, params, carry, own, acting, keys.env, key, hypers)
 
     if max_rows == config.rollout_steps:  # every env acts in every row: a plain scan
         carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=max_rows)
@@ -188,11 +190,19 @@ def _until_full(
 
 
 def _noise(parts: Collecting, key: Array, iteration: Array) -> Array:
-    """Action noise of all rows `[S, N, M]`, drawn T rows at a time as the host does."""
+    """Action noise of all rows `[S / hold, N, M]`, drawn T rows at a time as the host does."""
     config = parts.config
     blocks = jnp.arange(capacity(config) // config.rollout_steps)
     noise = jax.vmap(lambda block: draw_noise(parts.policy, config, key, iteration, block))(blocks)
     return noise.reshape((-1, *noise.shape[2:]))
+
+
+def _noise_row(parts: Collecting, t: Array) -> Array:
+    """The row of `_noise` that env step `t` of a rollout has."""
+    hold, block = parts.policy.hold, parts.config.rollout_steps
+    if hold == 1:
+        return t
+    return t // block * -(-block // hold) + t % block // hold
 
 
 def _seen(parts: Collecting, moments: LongMoments | tuple[()], raw: Array) -> Array:
@@ -216,14 +226,15 @@ def _step(
     policy, state = parts.policy, carry.state
     observation = _seen(parts, state.observation_moments, state.envs.observation)
     output = policy.apply(params, observation)
-    action = policy.distribution.sample(output.policy, noise)
+    action = policy.sample(params, output, noise)
     keep, filter_state = acting, carry.filter
     if parts.filter is not None:
         log_prob = policy.distribution.log_prob(output.policy, action)
         scored = ScoredStep(observation, action, log_prob, output.value, output.vex)
         filter_state, decided = parts.filter.keep(carry.filter, scored, filter_key, hypers)
         keep = decided & acting
-    envs, transition = advance(parts.env, state.envs, action, acting, env_key, parts.any_member)
+    shown = to_env(policy.distribution, action)
+    envs, transition = advance(parts.env, state.envs, shown, acting, env_key, parts.any_member)
     moments = state.observation_moments
     if isinstance(moments, LongMoments):
         moments = update_long_moments(moments, envs.observation, acting)

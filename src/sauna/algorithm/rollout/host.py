@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import (
     Moments,
     initial_moments,
@@ -154,7 +155,7 @@ class HostCollector:
             until = min(*ends, t - t % block + block)
             acting = np.stack([plan.acting for plan in plans])
             buffers.valid[:, t:until] = acting[:, None]
-            self._act(params, noise[t % block :], t, until, acting, final_values)
+            self._act(params, noise, t, until, acting, final_values)
             t = until
             for member in members:
                 if plans[member].last == t:
@@ -189,7 +190,7 @@ class HostCollector:
         return _Segment(t, t + int(wanted[acting].min()) if acting.any() else 0, acting)
 
     def _draw(self, iteration: int, block: int) -> np.ndarray:
-        """Action noise of T steps `[T, P, N, M]`."""
+        """Action noise of T steps `[T / hold, P, N, M]`."""
         return np.stack(
             [
                 np.asarray(self._program.draw(keys.action, np.int32(iteration), np.int32(block)))
@@ -207,15 +208,18 @@ class HostCollector:
         acting: np.ndarray,
         final_values: dict[tuple[int, int, int], float],
     ) -> None:
-        """Acts everywhere for rows `first` to `last` of the buffers."""
+        """Acts everywhere for rows `first` to `last` of the buffers; `noise` is of their block."""
+        policy, block = self._program.policy, self._config.rollout_steps
         actor, moments, seen = self._actor, self.observation_moments, self.state.observation
         shape, active, width = self._shape, acting.reshape(-1), self._spaces.action_width
         observations = self._observed
         actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
-            actions[row] = action = actor.act(observations[row], noise[row - first])
+            own = noise[row % block // policy.hold]
+            actions[row] = action = actor.act(observations[row], own)
             self._note_idle(row, acting)
-            step = self._envs.step(action.reshape(-1, width), active)
+            shown = to_env(policy.distribution, action)
+            step = self._envs.step(shown.reshape(-1, width), active)
             rewards[row] = step.reward.reshape(shape)
             seen = step.observation.reshape(seen.shape)
             if moments is None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import MAX_STEPS
@@ -17,6 +18,7 @@ from sauna.envs.device.contract import JaxEnv
 from sauna.envs.host.answers import one_number, reset_with
 from sauna.envs.info import IS_SUCCESS, SUCCESS_RATE, numbers_of
 
+_fold_in = jax.jit(jax.random.fold_in)  # compiled: a key is drawn at every env step
 _RESET = 2**31  # apart from the numbers of env steps, whose keys draw the actions
 
 
@@ -36,19 +38,21 @@ def play(
     seed: int,
     watch: Callable[[], None] = lambda: None,
     max_steps: int = MAX_STEPS,
+    hold: int = 1,
 ) -> Episode:
     """Plays one episode, cut after `max_steps` env steps.
 
     Args:
       policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes.
       watch: called after the reset and after each env step.
+      hold: env steps for which sampled actions have one key; see `Policy.hold`.
     """
     key = jax.random.key(seed)
     observation = reset_with(env, seed)
     watch()
     return_, length, ended, info = 0.0, 0, False, None
     while not ended and length < max_steps:
-        step_key = None if deterministic else jax.random.fold_in(key, length)
+        step_key = None if deterministic else _fold_in(key, length // hold)
         action = policy(observation, deterministic=deterministic, key=step_key)
         observation, reward, terminated, truncated, info = env.step(action)
         return_, length = return_ + one_number(reward), length + 1
@@ -106,12 +110,12 @@ def play_on_device(
         seen = now.observation
         if moments is not None:
             seen = normalize(moments, seen, config.clip_observations)
-        parameters = policy.apply(params, seen).policy
+        output = policy.apply(params, seen)
         if deterministic:
-            return distribution.mode(parameters)
-        own = jax.vmap(jax.random.fold_in, (0, None))(keys, now.t)
+            return to_env(distribution, distribution.mode(output.policy))
+        own = jax.vmap(jax.random.fold_in, (0, None))(keys, now.t // policy.hold)
         noise = jax.vmap(lambda key: distribution.draw(key, ()))(own)
-        return distribution.sample(parameters, noise)
+        return to_env(distribution, policy.sample(params, output, noise))
 
     def step(now: _Now) -> _Now:
         transition = jax.vmap(env.step)(now.state, act(now))

@@ -62,9 +62,9 @@ def make_program(config: Config, spaces: Spaces) -> Program:
 def draw_noise(
     policy: Policy, config: Config, root: Array, iteration: Array, block: Array
 ) -> Array:
-    """Action noise `[T, N, M]` of the rollout's rows from `block * T` on."""
+    """Action noise `[T / hold, N, M]`, rounded up, of the rollout's rows from `block * T` on."""
     key = jax.random.fold_in(jax.random.fold_in(root, iteration), block)
-    return policy.distribution.draw(key, (config.rollout_steps, config.envs))
+    return policy.distribution.draw(key, (-(-config.rollout_steps // policy.hold), config.envs))
 
 
 def _nothing_to_decide(*arguments: Any) -> tuple[Any, Array]:

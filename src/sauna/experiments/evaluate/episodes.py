@@ -14,11 +14,13 @@ from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.play import Progress
 from sauna.experiments.evaluate.video import check_drawn, record_video
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
+from sauna.system.safe_write import own_folder
 from sauna.system.working_folder import kept_folder
 from sauna.training.artifact import (
     Artifact,
@@ -27,6 +29,7 @@ from sauna.training.artifact import (
     find_member,
     load_artifact,
 )
+from sauna.training.located import locate
 
 if TYPE_CHECKING:
     from sauna.algorithm.rollout.play import Episode
@@ -65,7 +68,7 @@ def evaluate(
     `evaluation_MODE.json`; anything else is only returned.
 
     Args:
-      run: the run directory.
+      run: the run directory; or an exported policy: its folder, `zoo:NAME`, `hf:USER/NAME`.
       member: only this one; default all.
       deterministic: the distribution's mode; otherwise actions are sampled.
       seed: episodes are reset with seeds `seed`, `seed + 1`, ...
@@ -88,11 +91,11 @@ def evaluate(
         `best`, a member was not evaluated during training; with `video`, `env` has no pictures.
       VideoFailure: a video was asked for and the environment cannot render here.
     """
-    run = Path.cwd() / run  # an environment may go elsewhere
+    run, written = locate(run)
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
     artifact = load_artifact(run, say, checkpoint, trust=trust)
-    env = _provided(run, env, parts)
+    env = provided(run, env, parts)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]
     own = artifact.config.env
     mode = "deterministic" if deterministic else "sampled"
@@ -109,7 +112,7 @@ def evaluate(
         result["env_kwargs"] = kwargs
     if video:
         check_drawn(result["env"], kwargs)
-    made = make_env(result["env"], kwargs)
+    made = make_env(result["env"], kwargs, wrapping_of(artifact.config))
     check_spaces(artifact, made)
     from sauna.algorithm.rollout.play import play, success_rate  # imports JAX: after the checks
     from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -117,20 +120,22 @@ def evaluate(
     for name in chosen:
         policy = TrainedPolicy(artifact, name, made, best)
         progress = Progress(name, episodes, say)
+        watch, hold = progress.step, policy.policy.hold
         played = [
-            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
+            progress.played(play(policy, made, deterministic, seed + i, watch, max_steps, hold))
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played) | success_rate(played)
         progress.say_cut(max_steps)
     close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
-        run_directory.write_json(run / f"evaluation_{'best_' * best}{mode}.json", result)
+        own_folder(written)
+        run_directory.write_json(written / f"evaluation_{'best_' * best}{mode}.json", result)
     if video:
         label = f"{chosen[0].replace('/', '-')}_{'best_' * best}{mode}" + f"_{checkpoint}" * (
             checkpoint is not None
         )
-        path = run / "videos" / f"{label}.mp4"
+        path = written / "videos" / f"{label}.mp4"
         how = deterministic, seed, max_steps, best
         try:
             record_video(path, artifact, chosen[0], result["env"], kwargs, *how)
@@ -140,10 +145,12 @@ def evaluate(
     return result
 
 
-def _provided(run: Path, env: Any, parts: Mapping[str, Any]) -> str | None:
+def provided(run: Path, env: Any, parts: Mapping[str, Any]) -> str | None:
     """The name of another environment, if one is asked for; parts of the run are put in place."""
     if env is not None and not isinstance(env, str):
-        if is_local(str(run_directory.read_config(run).get("config", {}).get("env"))):
+        if is_local(
+            str(run_directory.read_config(run, exported=True).get("config", {}).get("env"))
+        ):
             parts, env = {**parts, "env": env}, None
         else:
             env = name_of(env)

@@ -14,6 +14,7 @@ from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.training.artifact import Artifact, best_of, check_spaces, find_member
 from sauna.training.loop.member_state import fitting, flat_params
@@ -42,7 +43,7 @@ class TrainedPolicy(FrozenPolicy):
     ) -> None:
         config, self.name = artifact.config, find_member(artifact.members, member)
         made = env is None
-        env = env or make_env(config.env, json.loads(config.env_kwargs))
+        env = env or make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config))
         check_spaces(artifact, env)
         own = under(self.name + "/", artifact.checkpoint.arrays)
         if best:
@@ -66,6 +67,18 @@ class TrainedPolicy(FrozenPolicy):
             )
         self.load(params, moments)
         self._calls = 0  # of `predict`
+
+    def make_env(self, **more: Any) -> Any:
+        """Makes the environment of the run, with the run's wrappers.
+
+        Args:
+          **more: further keyword arguments of the environment, such as `render_mode`.
+
+        Raises:
+          BadInput: it cannot be made.
+        """
+        config = self.config
+        return make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config), **more)
 
     def predict(
         self,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sauna.config.imported_from import names_the_folder
 from sauna.experiments.evaluate import MAX_STEPS
+from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.safe_write import replace_file
 from sauna.system.working_folder import kept_folder
@@ -50,6 +51,7 @@ def inspect(
     run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    run_directory.read_config(run, needed=())  # an exported policy does not know how it learned
     artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"

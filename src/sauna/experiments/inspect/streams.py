@@ -14,6 +14,7 @@ from sauna.algorithm.types import Rollout
 from sauna.config.settings import Config
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import environments
 from sauna.experiments.inspect.learned import reads_rollouts
@@ -51,7 +52,7 @@ def more_plays(
     close(env)
     plays = [played]
     for n in range(1, number):
-        env = make_env(config.env, json.loads(config.env_kwargs))
+        env = make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config))
         length = len(played.reward)
         plays.append(play_steps(policy, env, length, deterministic, seed, n, max_steps=max_steps))
         close(env)

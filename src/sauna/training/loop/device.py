@@ -26,6 +26,7 @@ from sauna.config.presets import Member
 from sauna.config.settings import Config, fields_with, to_json
 from sauna.envs.device.contract import flat
 from sauna.envs.device.make import make_jax_env
+from sauna.envs.device.stacked import stacked
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
@@ -136,7 +137,8 @@ def _settings(job: Job) -> str:
 def make_population(job: Job) -> Population:
     """The job's members at the start of their training."""
     config = job.config
-    env = flat(make_jax_env(config.env, job.env_kwargs), config.rescale_actions)
+    env = stacked(make_jax_env(config.env, job.env_kwargs), config.stack)
+    env = flat(env, config.rescale_actions)
     settings = [_setting(member) for member in job.members]
     devices = _devices(config)
     mesh = make_mesh(len(settings), config.envs, devices)

@@ -1,0 +1,1 @@
+"""Recorded episodes: what they are, and their files."""

@@ -1,0 +1,174 @@
+"""ONNX and numpy forms act as the policy does, for each kind of observation, network and action."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from gymnasium import spaces as gym
+from safetensors.numpy import save
+
+from helpers import configured
+from sauna.algorithm.policy.frozen import FrozenPolicy
+from sauna.algorithm.policy.normalize import Moments
+from sauna.config.settings import Config
+from sauna.envs.spaces import describe
+from sauna.experiments.share.graph import Graph
+from sauna.experiments.share.numpy_file import to_numpy
+from sauna.experiments.share.onnx_file import to_onnx
+from sauna.experiments.share.policy_graph import policy_graph
+from sauna.experiments.share.same import check_same, numpy_policy, onnx_policy
+from sauna.system.errors import BadInput, SaunaError
+from sauna.training.loop.member_state import named_params
+
+MANY = 1000  # observations
+INF = np.inf
+BOX = gym.Box(-INF, INF, (5,))
+BOUNDED = gym.Box(np.array([-2, -INF, 0], np.float32), np.array([3, INF, 0.5], np.float32))
+FINITE = gym.Box(np.array([-2, 1], np.float32), np.array([3, 1.5], np.float32))
+NESTED = gym.Dict(
+    {
+        "b": gym.Box(-1, 1, (2, 2), np.float64),
+        "a": gym.Tuple([gym.Discrete(3, start=-1), gym.MultiDiscrete([2, 3])]),
+        "it's": gym.MultiBinary(2),
+    }
+)
+BYTES = gym.Box(0, 255, (3, 38, 36), np.uint8)
+# Each kind of observation, network and action at least once: (observations, actions, settings).
+KINDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+    "normalised, tanh, clipped": (BOX, gym.Box(-0.3, 0.3, (2,)), {"normalize": True}),
+    "stretched": (BOX, BOUNDED, {"rescale_actions": True, "activation": "relu"}),
+    "float64, shaped box": (
+        gym.Box(-1, 1, (2, 3), np.float64),
+        gym.Box(-0.3, 0.3, (1, 2), np.float64),
+        {"normalize": True, "trunk": "shared"},
+    ),
+    "squashed": (BOX, FINITE, {"distribution": "squashed", "rescale_actions": True}),
+    "beta": (BOX, FINITE, {"distribution": "beta", "rescale_actions": True}),
+    "one choice": (gym.Discrete(4), gym.Discrete(3, start=2), {"hidden": (8,)}),
+    "nested, choices": (NESTED, gym.MultiDiscrete([2, 4]), {"normalize": True}),
+    "bits": (gym.MultiDiscrete([3, 2]), gym.MultiBinary(3), {}),
+    "board, flattened": (gym.Box(0, 4, (3, 3, 2), np.uint8), gym.Discrete(4), {}),
+    "pictures": (BYTES, gym.Discrete(4), {"network": "nature-cnn", "trunk": "shared"}),
+    "last channel, box": (gym.Box(0, 1, (36, 36), np.uint8), BOUNDED, {"network": "nature-cnn"}),
+}
+
+
+@cache
+def policy_of(kind: str) -> tuple[FrozenPolicy, Graph, Any]:
+    """A policy with random weights, the graph of it, and its observation space."""
+    observed, acted, settings = KINDS[kind]
+    settings = {"hidden": (16, 8), **settings}
+    normalised = settings.pop("normalize", False)
+    plain = dataclasses.replace(configured(), rescale_actions=False, network="mlp")
+    config = dataclasses.replace(plain, normalize_observations=normalised, **settings)
+    return made(config, observed, acted)
+
+
+def made(config: Config, observed: Any, acted: Any) -> tuple[FrozenPolicy, Graph, Any]:
+    spaces, random = describe(observed, acted), np.random.default_rng(0)
+    env = SimpleNamespace(observation_space=observed, action_space=acted)
+    policy = FrozenPolicy(config, spaces, env)
+    size = policy.policy.init(jax.random.key(0)).size
+    params = 0.3 * random.standard_normal(size).astype(np.float32)
+    moments = None
+    if config.normalize_observations:
+        length = spaces.observation_shape
+        variance = random.uniform(0.1, 3, length)
+        moments = Moments(random.standard_normal(length), variance, np.ones(1))
+    policy.load(params, moments)
+    arrays = {f"params/{k}": v for k, v in named_params(policy.policy, policy.params).items()}
+    if moments is not None:
+        arrays |= {f"observation_moments/{k}": v for k, v in moments._asdict().items()}
+    return policy, policy_graph(config, arrays, observed, acted), observed
+
+
+def sampled(space: Any, number: int) -> list[Any]:
+    space.seed(0)
+    return [space.sample() for _ in range(number)]
+
+
+DEFAULT = [kind for kind in KINDS if kind != "last channel, box"]
+EVERY = [*DEFAULT, pytest.param("last channel, box", marks=pytest.mark.slow)]  # it compiles long
+
+
+def number_of(kind: str) -> int:
+    """Of observations; pictures are many numbers each."""
+    return 30 if "nature-cnn" in KINDS[kind][2].values() else MANY
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
+    policy, graph, space = policy_of(kind)
+    act, seen = numpy_file(graph, tmp_path), sampled(space, number_of(kind))
+    check_same("numpy", policy, act, seen)
+    one = act(seen[0])
+    np.testing.assert_allclose(one, policy(seen[0]), rtol=1e-5, atol=1e-5)
+    assert np.shape(one) == np.shape(policy(seen[0]))
+    assert len((tmp_path / "policy.py").read_text().splitlines()) <= 60
+
+
+def numpy_file(graph: Graph, folder: Path) -> Callable[[Any], Any]:
+    (folder / "policy.safetensors").write_bytes(save(graph.constants))
+    (folder / "policy.py").write_text(to_numpy(graph, "A policy."))
+    return numpy_policy(folder / "policy.py")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_onnx_acts_as_the_policy(kind: str) -> None:
+    pytest.importorskip("onnxruntime", reason="needs `pip install 'sauna-rl[onnx]'`")
+    policy, graph, space = policy_of(kind)
+    act = onnx_policy(to_onnx(graph, kind), graph)
+    check_same("onnx", policy, act, sampled(space, number_of(kind)))
+    check_same("onnx", policy, act, sampled(space, 1))
+
+
+def test_a_form_that_acts_otherwise_is_refused(tmp_path: Path) -> None:
+    policy, graph, space = policy_of("normalised, tanh, clipped")
+    seen = sampled(space, 10)
+    right, wrong = numpy_file(graph, tmp_path), np.array(seen) + 1e-3
+    with pytest.raises(SaunaError, match="differs from the policy's by"):
+        check_same("numpy", policy, lambda batch: right(wrong), seen)
+    with pytest.raises(SaunaError, match=r"float64\[10, 2\], the policy's float32\[10, 2\]"):
+        check_same("numpy", policy, lambda batch: policy(batch).astype(np.float64), seen)
+
+
+def test_a_title_of_somebody_elses_ends_no_text(tmp_path: Path) -> None:
+    _, graph, _ = policy_of("bits")
+    text = to_numpy(graph, '"""\nraise SystemExit\n"""\\')
+    (first, *_) = ast.parse(text).body
+    assert isinstance(first, ast.Expr) and "raise SystemExit" in ast.get_docstring(ast.parse(text))
+
+
+def test_a_network_of_ones_own_is_refused() -> None:
+    config = dataclasses.replace(configured(), network="own_networks:Net")
+    with pytest.raises(BadInput, match="network own_networks:Net; only mlp and nature-cnn are"):
+        policy_graph(config, {}, BOX, gym.Discrete(2))
+
+
+def test_numpy_alone_runs_the_file(tmp_path: Path) -> None:
+    policy, graph, space = policy_of("normalised, tanh, clipped")
+    numpy_file(graph, tmp_path)
+    seen = sampled(space, 3)
+    code = (
+        "import json, sys\n"
+        "for name in ('jax', 'flax', 'gymnasium', 'sauna'): sys.modules[name] = None\n"
+        "import policy\n"
+        f"print(json.dumps(policy.act({np.array(seen).tolist()}).tolist()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    np.testing.assert_allclose(json.loads(done.stdout), policy(np.array(seen)), atol=1e-5)
