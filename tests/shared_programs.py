@@ -18,8 +18,8 @@ from typing import Any
 import jax
 
 from sauna.algorithm.learner import program as learning
-from sauna.algorithm.policy import policy as policies
 from sauna.algorithm.learner.program import Learner
+from sauna.algorithm.policy import policy as policies
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import program as collecting
 from sauna.algorithm.rollout.program import Program

@@ -160,7 +160,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page, dict[s
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
     folder = tmp_path_factory.mktemp("hostile")
-    return folder / "report.html", written(make_results(("HalfCheetah-v5",), mark=HOSTILE), folder)[0]
+    results = make_results(("HalfCheetah-v5",), mark=HOSTILE)
+    return folder / "report.html", written(results, folder)[0]
 
 
 def expected(row: dict[str, Any]) -> list[list[float]]:
