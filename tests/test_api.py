@@ -24,6 +24,7 @@ from sauna.training.artifact import load_artifact
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
+pytestmark = pytest.mark.draws
 
 
 class Listed(sauna.Tracker):
