@@ -29,6 +29,7 @@ from selection_page import SELECTION, selection_page
 from studies import MEASURED, ROOT, STUDIES, load, page_of
 from study_pages import pong_text, ppo_page, study_page
 from summary_page import findings, index
+from tune_page import tune_text
 from zoo_page import draw_zoo, zoo_page
 
 from sauna.experiments.report.figures import draw_plots, write_figures
@@ -177,6 +178,8 @@ def write_pages() -> None:
     if clones := load("clone"):
         text = clone_text(clones["tasks"])
         insert(ROOT / "docs" / "how-to" / "record_and_clone.md", "clone", text)
+    if tuned := load("tune"):
+        insert(ROOT / "docs" / "how-to" / "tune.md", "tune", tune_text(tuned))
     if results := load("pong"):
         insert(ROOT / "docs" / "how-to" / "atari.md", "pong", pong_text(results))
 
