@@ -121,6 +121,8 @@ def scored(vex: np.ndarray) -> ScoredStep:
 def test_lost_lives_and_signs_are_what_is_learned() -> None:
     """Three lives of two steps in one game, rewards 5 and -3."""
     policy: Any = SimpleNamespace(
+        reset=lambda: None,
+        policy=SimpleNamespace(state_size=0),
         see=np.asarray,
         act=lambda observation, deterministic, key: np.array([1]),
         write=lambda action: action[0],
@@ -249,7 +251,7 @@ def test_advantages_over_kept_steps_are_the_updates() -> None:
         "keep": keep,
         "valid": np.ones((length, 1), bool),
     }
-    stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields))
+    stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields[:-1]))
     hypers = hypers_of(config)
     update = jax.jit(partial(make_batch, config=config, target=make_target(config)))
     batch = update(stream, hypers, jax.random.key(0))

@@ -20,6 +20,7 @@ NO_KL_RATE = (
 )
 ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
+RECURRENT = ("recurrent lstm or gru", lambda c: c.recurrent != "none")
 VALUE_MLP = (
     "the mlp network with trunk separate",
     lambda c: c.network in ("auto", "mlp") and c.trunk == "separate",

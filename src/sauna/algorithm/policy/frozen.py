@@ -24,6 +24,9 @@ class FrozenPolicy:
 
     The action is the distribution's mode unless `deterministic=False` and a key are given.
 
+    A recurrent policy remembers the observations that it is called with: call `reset` at the start
+    of an episode.
+
     Args:
       config: whose network and normalisation it has.
       spaces: of `env`.
@@ -39,6 +42,7 @@ class FrozenPolicy:
         self._dtype = spaces.observation_dtype
         self.policy: Policy = make_policy(config, spaces)
         self.params: Any = None
+        self.state: Any = ()  # [n, H] of a recurrent policy; () before an episode's first step
         self._moments: Moments | None = None
         self._act = jax.jit(self._choose, static_argnames="deterministic")
         self._predict = jax.jit(self._heads)
@@ -47,14 +51,29 @@ class FrozenPolicy:
     def load(self, params: Array, moments: Moments | None) -> None:
         """Takes over parameters `[D]` and moments of `[obs]`; None: nothing is normalised."""
         self.params, self._moments = jax.numpy.asarray(params), moments
+        self.reset()
 
-    def _choose(self, params: Array, observation: Any, key: Any, *, deterministic: bool) -> Any:
+    def reset(self, ended: Any = None) -> None:
+        """Forgets what was observed; a policy that is not recurrent has nothing to forget.
+
+        Args:
+          ended: `[n]` bool, which of a batch's episodes have ended; default all.
+        """
+        if ended is None or isinstance(self.state, tuple):
+            self.state = ()
+        else:
+            over = np.asarray(ended, bool).reshape(-1)
+            self.state = np.where(over[:, None], np.float32(0.0), self.state)
+
+    def _choose(
+        self, params: Array, observation: Any, state: Any, key: Any, *, deterministic: bool
+    ) -> Any:
         distribution = self.policy.distribution
-        output = self.policy.apply(params, observation)
+        output, state = self.policy.step(params, observation, state)
         if deterministic:
-            return distribution.mode(output.policy)
+            return distribution.mode(output.policy), state
         noise = distribution.draw(key, output.policy.shape[:-1])
-        return self.policy.sample(params, output, noise)
+        return self.policy.sample(params, output, noise), state
 
     def __call__(
         self,
@@ -75,7 +94,8 @@ class FrozenPolicy:
             masks.
 
         Raises:
-          BadInput: `observation` is not of the environment's space, or the mask is none.
+          BadInput: `observation` is not of the environment's space, the mask is none, or a
+            recurrent policy has another number of episodes to remember.
         """
         rows, is_batch = self._rows(self._with_mask(observation, action_mask))
         actions = self._choices(rows, deterministic, key)
@@ -113,8 +133,26 @@ class FrozenPolicy:
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
         key = jax.random.key(0) if key is None else key
-        seen = self._seen(rows)
-        return np.asarray(self._act(self.params, seen, key, deterministic=deterministic))
+        state = self.state_for(len(rows))
+        actions, self.state = self._act(
+            self.params, self._seen(rows), state, key, deterministic=deterministic
+        )
+        return np.asarray(actions)
+
+    def state_for(self, number: int) -> Any:
+        """The states `[number, H]` with which as many episodes go on, or begin.
+
+        Raises:
+          BadInput: another number of episodes goes on.
+        """
+        if isinstance(self.state, tuple):
+            return self.policy.initial_state(number)
+        if len(self.state) != number:
+            raise BadInput(
+                f"a recurrent policy remembers {len(self.state)} episodes, and got observations of "
+                f"{number}; call reset() first"
+            )
+        return self.state
 
     def _rows(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Raw observations as arrays `[n, *obs]`, and whether they came as a batch."""

@@ -17,6 +17,7 @@ import numpy as np
 from sauna.algorithm.policy.gsde import deviation
 from sauna.algorithm.policy.observation import INVALID
 from sauna.algorithm.policy.policy import Policy
+from sauna.algorithm.rollout.memory import HostMemory
 from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
@@ -61,6 +62,19 @@ class CompiledActor:
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
         return np.asarray(self._act(self._params, observation, noise))
+
+
+class RecurrentActor(CompiledActor):
+    """Acts by `Program.act` with the states of `memory`, and moves them on."""
+
+    def __init__(self, act: Any, memory: HostMemory) -> None:
+        super().__init__(act)
+        self._memory = memory
+
+    def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        action, state = self._act(self._params, observation, noise, self._memory.state)
+        self._memory.advance(np.asarray(state))
+        return np.asarray(action)
 
 
 class MLPActor:
@@ -291,8 +305,17 @@ def _largest(logits: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
     return np.stack([part.argmax(-1) for part in parts], -1).astype(np.int32)
 
 
-def make_actor(config: Config, spaces: Spaces, policy: Policy, act: Any, members: int) -> Actor:
-    """The fastest actor for the network of `config`."""
+def make_actor(
+    config: Config,
+    spaces: Spaces,
+    policy: Policy,
+    act: Any,
+    members: int,
+    memory: HostMemory | None = None,
+) -> Actor:
+    """The fastest actor for the network of `config`; `memory` is read if it is recurrent."""
+    if policy.state_size and memory is not None:
+        return RecurrentActor(act, memory)
     if config.network == "mlp" and len(spaces.observation_shape) == 1 and not spaces.pictures:
         return MLPActor(config, spaces, policy, members)
     return CompiledActor(act)

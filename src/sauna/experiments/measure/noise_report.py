@@ -120,6 +120,8 @@ def check(configs: Sequence[Config]) -> None:
     """
     if not any(map(drops_steps, configs)):
         raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
+    if any(config.recurrent != "none" for config in configs):
+        raise BadInput("recurrent: measure = noise draws single steps, which have no past")
 
 
 def drops_steps(config: Config) -> bool:

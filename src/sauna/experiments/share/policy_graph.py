@@ -66,6 +66,8 @@ def _check(config: Config, spaces: Spaces) -> None:
     unknown = ""
     if config.network not in NETWORKS:
         unknown = f"network {config.network}; only {' and '.join(NETWORKS)} are"
+    elif config.recurrent != "none":
+        unknown = f"recurrent {config.recurrent}"
     elif config.network == "mlp" and config.activation not in ACTIVATIONS:
         unknown = f"activation {config.activation}"
     elif config.network == "mlp" and config.layer_norm:

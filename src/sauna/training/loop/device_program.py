@@ -315,7 +315,7 @@ def shardings(mesh: Mesh, states: MemberState) -> Any:
     members = NamedSharding(mesh, PartitionSpec(MEMBERS))
     envs = NamedSharding(mesh, PartitionSpec(MEMBERS, ENVS))
     places = jax.tree.map(lambda _: members, states)
-    per_env = ("envs", "discounted_return", "episode_return", "episode_length")
+    per_env = ("envs", "discounted_return", "episode_return", "episode_length", "memory")
     collect = places.collect._replace(
         **{name: jax.tree.map(lambda _: envs, getattr(states.collect, name)) for name in per_env}
     )
