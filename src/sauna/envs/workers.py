@@ -13,6 +13,7 @@ from sauna.envs.host.contract import HostEnvs, Snapshot, Step
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import read_spaces
+from sauna.envs.wrapping import PLAIN, Wrapping, read_wrapping
 from sauna.system.errors import SaunaError, one_line
 from sauna.system.processes import Message, child_ends, receive, send, start_worker
 from sauna.system.tracebacks import cause_of, describe_failure
@@ -30,7 +31,7 @@ class ProcessEnvs(HostEnvs):
       seeds: `(member seed, env index)` of each environment.
       processes: number of workers.
       timeout: seconds after which a silent worker counts as hung.
-      backend, rescale: of each worker; see `in_process_envs`.
+      backend, rescale, wrapping: of each worker; see `in_process_envs`.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class ProcessEnvs(HostEnvs):
         timeout: float,
         backend: str = "auto",
         rescale: bool = False,
+        wrapping: Wrapping = PLAIN,
     ) -> None:
         self._timeout = timeout
         self._parts = np.array_split(np.arange(len(seeds)), processes)
@@ -58,6 +60,7 @@ class ProcessEnvs(HostEnvs):
                         "seeds": chosen,
                         "backend": backend,
                         "rescale": rescale,
+                        "wrapping": wrapping._asdict(),
                     }
                 )
             except BrokenPipeError:
@@ -169,7 +172,7 @@ def main() -> None:
     try:
         header = receive(inbox).header
         seeds = [(int(a), int(b)) for a, b in header["seeds"]]
-        how = header["backend"], header["rescale"]
+        how = header["backend"], header["rescale"], read_wrapping(header["wrapping"])
         envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
         while True:

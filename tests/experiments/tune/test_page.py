@@ -61,7 +61,6 @@ def test_the_page_says_what_was_found_and_on_what_evidence() -> None:
     assert page.count("data:image/svg+xml") == 3
     assert "&lt;b&gt;not finite&lt;/b&gt;" in page and "<b>not finite" not in page
     assert "No difference is decided." in page and 'href="fresh_0/report.html"' in page
-    assert page == make_page(found())
 
 
 def test_a_page_of_nothing_and_of_no_fresh_seeds_says_so() -> None:
@@ -89,4 +88,5 @@ def test_fresh_seeds_and_exchanges_as_tables() -> None:
     one |= {"copied": {"gamma": 0.9, "hidden": "8"}, "settings": {"gamma": 0.95, "hidden": "8"}}
     rows = exchange_rows(found(exchanges=[one]))
     assert rows[1] == ["400", "1", "-3.00", "0", "-1.00", "0.9 -> 0.95", "8 -> 8"]
-    assert "<h2>Exchanges</h2>" in make_page(found(exchanges=[one]))
+    nothing = {"trials": [], "best": None, "importance": {}, "fresh": {}}  # which draws nothing
+    assert "<h2>Exchanges</h2>" in make_page(found(**nothing, exchanges=[one]))

@@ -16,6 +16,7 @@ import numpy as np
 from sauna.algorithm.rollout.play import play
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_drawn_env, make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import choose_renderer, not_drawn
 from sauna.experiments.measure.streams import MemberSnapshot
@@ -46,8 +47,8 @@ def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]
     """
     artifact = load_artifact(snapshot.run, iteration=snapshot.iteration)
     name, picture = snapshot.member.name, file.with_suffix(".png")
-    kwargs = json.loads(artifact.config.env_kwargs)
-    env = make_env(artifact.config.env, kwargs)
+    kwargs, around = json.loads(artifact.config.env_kwargs), wrapping_of(artifact.config)
+    env = make_env(artifact.config.env, kwargs, around)
     policy = TrainedPolicy(artifact, name, env)
     episodes, seen = [], np.zeros(0, bool)
     for i in range(EPISODES):
@@ -93,7 +94,7 @@ def _draw(
             pictures[step] = Image.fromarray(env.render()).resize((SIDE, SIDE))
 
     try:
-        env = make_drawn_env(artifact.config.env, kwargs)
+        env = make_drawn_env(artifact.config.env, kwargs, wrapping_of(artifact.config))
         policy = TrainedPolicy(artifact, name, env)
         play(policy, env, False, SEED + shown, look, hold=policy.policy.hold)
     except Exception as error:  # renderers fail in every way there is

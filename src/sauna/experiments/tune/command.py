@@ -128,7 +128,7 @@ def _tune(
         fresh.try_finalists(plan, written["trials"], place, command, **how)
         written = results.write(plan, search, place, command)
     if plan.fresh and written["best"] is not None:
-        say(f"\ntrial {written['best']['number']} is best; it is tried on fresh seeds")
+        say(f"trial {written['best']['number']} is best; it is tried on fresh seeds")
         fresh.evaluate(plan, written["best"]["settings"], place, command, **how)
         written = results.write(plan, search, place, command)
     return written

@@ -78,8 +78,19 @@ class Search:
                 run_directory.write_json(place / "asking.json", journal)
                 run_directory.write_json(note, {"trials": self._ask(range(first, last))})
             trials = run_directory.read_config_file(note)["trials"]
-            self._train(place, [n for n in trials if self._is_open(n)])
+            if is_open := [n for n in trials if self._is_open(n)]:
+                self._train(place, is_open)
+                self._display().say(self._so_far(first + len(trials)))
             number, first = number + 1, first + len(trials)
+
+    def _so_far(self, ended: int) -> str:
+        """Says how many trials have ended, and which is the best."""
+        text = f"{ended} of {self._plan.trials} trials have ended"
+        done = [t for t in self.study.get_trials(deepcopy=False) if t.state.name == "COMPLETE"]
+        if not done:
+            return text
+        best = max(done, key=lambda trial: trial.value)
+        return f"{text}; best so far: trial {best.number}, return {best.value:.4g}"
 
     def _forget_half_asked(self) -> None:
         """Takes back what was asked for a batch that was not whole: it is asked for again."""
@@ -124,8 +135,6 @@ class Search:
 
     def _train(self, place: Path, numbers: list[int]) -> None:
         """Trains the open trials of a batch; one by one if they failed together."""
-        if not numbers:
-            return
         split = place / "split.json"
         if not split.exists():
             error = self._train_together(place / "run", numbers)
