@@ -31,7 +31,7 @@ entropy_coef = {low = 1e-8, high = 0.1, log = true}
 value_coef = {low = 0.1, high = 2.0}
 max_grad_norm = [0.3, 0.5, 1.0, 2.0, 5.0]
 """
-SEEDS = range(5)
+SEEDS = range(4)
 EQUAL = (
     f"Pendulum-v1 {START} --envs 4 --rollout-steps 128 --minibatches 4 --epochs 5 --steps 4e4 "
     "--trials 8 --finalists 1 --fresh-seeds 0 --space runs/traced.toml"
@@ -40,6 +40,7 @@ KINDS = {
     "population": "--population-based --exchange-every 4096",
     "random": "--search random --pruner none --lockstep 8",
 }
+OF_ROWS = ("label", "seeds", "failed", "final_mean", "final_std", "env_steps")
 KEPT = ("number", "state", "return", "env_steps", "searched", "error")
 
 
@@ -75,7 +76,7 @@ def search(found: dict[str, Any]) -> dict[str, Any]:
     kept = ("metric", "steps", "env_steps", "importance", "fresh_seeds", "verdict", "versions")
     tables = {
         name: [
-            {key: row[key] for key in ("label", "seeds", "failed", "final_mean", "final_std")}
+            {key: row[key] for key in OF_ROWS}
             for row in found[name].get("table", [])
         ]
         for name in ("finalists", "fresh")

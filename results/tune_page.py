@@ -39,10 +39,11 @@ def _search(env: str, search: Mapping[str, Any], command: str) -> str:
 
 
 def _fresh(search: Mapping[str, Any]) -> str:
-    rows = ["| On the fresh seeds | seeds | final return, mean ± std |", "|---|---|---|"]
+    rows = ["| On the fresh seeds | seeds | env steps | final return, mean ± std |"]
+    rows.append("|---|---|---|---|")
     for row in search["fresh"]:
         value = f"{row['final_mean']:.0f} ± {row['final_std']:.0f}"
-        rows.append(f"| {row['label']} | {row['seeds']} | {value} |")
+        rows.append(f"| {row['label']} | {row['seeds']} | {row['env_steps']:,.0f} | {value} |")
     return "\n".join(rows) + "\n\n" + "\n".join(f"- {text}" for text in search["verdicts"])
 
 

@@ -16,6 +16,8 @@ FLOORS = (
     "config",
     "envs.registration",
     "envs.info",
+    "envs.masked",
+    "envs.pictures",
     "envs.shapes",
     "envs.spaces",
     "envs.stacked",

@@ -34,7 +34,8 @@ from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
 
-LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
+_CHOICES = ("arms", "rules", "presets", "filters", "targets", "studies")
+LISTS = ("zoo", "envs", "atari", *NATIVE, *_CHOICES)
 # Where a comparison or a study trains.
 _PLACE: dict[str, dict[str, Any]] = {
     "out": {

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from sauna.config import readers
 from sauna.config.plugins import import_name, is_local
 from sauna.config.settings import FIELDS, Config, fields_with
 from sauna.system.errors import BadInput
@@ -108,6 +109,7 @@ def check_consistent(config: Config) -> None:
         raise BadInput("env_processes: more worker processes than environments")
     check_rate(config)
     check_rules(config)
+    check_recurrent(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
     for path in config.wrap:
@@ -210,7 +212,12 @@ def check_replay(config: Config) -> None:
     Raises:
       BadInput: with the one line that says which.
     """
-    plain = {"gae_over": "all", "critic": "squared", "recompute_advantages": False}
+    plain = {
+        "gae_over": "all",
+        "critic": "squared",
+        "recompute_advantages": False,
+        "recurrent": "none",
+    }
     for name, value in plain.items():
         if getattr(config, name) != value:
             raise BadInput(f"replay_rollouts: not read with {name} {getattr(config, name)}")
@@ -235,6 +242,38 @@ def check_passes(config: Config) -> None:
             raise BadInput("loss_weight: sample-dropout needs a ratio other than 1; A2C's is 1")
     if config.recompute_advantages and (config.algorithm == "a2c" or config.epochs == 1):
         raise BadInput("recompute_advantages: needs more than one epoch")
+
+
+def check_recurrent(config: Config) -> None:
+    """Refuses what a recurrent policy cannot be trained with.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.recurrent == "none":
+        return
+    length, batch = config.sequence_length, config.rollout_steps * config.envs
+    if config.rollout_steps % length:
+        raise BadInput(
+            f"sequence_length: {length} does not divide rollout_steps {config.rollout_steps}"
+        )
+    if (batch // length) % config.minibatches:
+        raise BadInput(
+            f"minibatches: {config.minibatches} does not divide the {batch // length} sequences of "
+            f"{length} steps in a rollout"
+        )
+    if readers.CLONED[1](config):
+        raise BadInput("init_from: recorded episodes are cloned step by step; use recurrent none")
+    if config.loss_weight != "none" and config.control == "random":
+        raise BadInput(
+            "control: the random control of a loss_weight needs a minibatch in random order, and "
+            "with recurrent its rows stand in sequences; use reversed"
+        )
+    if config.auxiliary == "shuffled-observation":
+        raise BadInput(
+            "auxiliary: shuffled-observation needs a minibatch in random order, and with recurrent "
+            "its rows stand in sequences; use next-observation"
+        )
 
 
 def local_parts(config: Config) -> list[str]:

@@ -156,6 +156,20 @@ class Config(RunOptions):
     trunk: str = _network(
         "separate", "whether policy and value share a trunk", choices=("separate", "shared")
     )
+    recurrent: str = _network(
+        "none",
+        "a cell behind each trunk that remembers what an episode has shown",
+        choices=("none", "lstm", "gru"),
+    )
+    recurrent_width: int = _network(
+        64, "width of that cell", at_least=1, read_when=readers.RECURRENT
+    )
+    sequence_length: int = _network(
+        16,
+        "env steps over which gradients flow back through it: minibatches are made of sequences",
+        at_least=1,
+        read_when=readers.RECURRENT,
+    )
     distribution: str = _network(
         "gaussian",
         "of continuous actions: a Gaussian, clipped; one under a tanh (squashed) or a Beta on the "

@@ -10,7 +10,7 @@ from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_num
 from sauna.envs.host.parallel_envs import AgentsAsOne
 from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
-from sauna.envs.shapes import check_shapes
+from sauna.envs.shapes import check_shapes, mask_in
 from sauna.envs.spaces import Spaces, describe, observation_reader
 from sauna.envs.wrapping import PLAIN, Wrapping, wrapped_space
 from sauna.system.errors import BadInput, one_line
@@ -73,6 +73,8 @@ def probe_on_device(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = P
 
     made = make_jax_env(env, env_kwargs)
     spaces = describe(wrapped_space(made, wrapping), made.action_space)
+    if spaces.mask and made.action_mask is None:
+        raise BadInput("action_mask: the environment gives none (JaxEnv.action_mask)")
     if ":" in env:
         _check_traced(env, made, spaces, wrapping)
     return Probe(spaces, None)
@@ -89,7 +91,8 @@ def _check_traced(env: str, made: Any, spaces: Spaces, wrapping: Wrapping) -> No
     from sauna.envs.device.contract import flat
     from sauna.envs.device.stacked import stacked
 
-    one = flat(stacked(_with_checked_shapes(made), wrapping.stack))
+    made = stacked(_with_checked_shapes(made), wrapping.stack)
+    one = flat(made, masked=wrapping.action_mask)
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
     try:
         state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))
@@ -152,16 +155,26 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
         return found
 
     env.action_space.seed(seed)
-    seen = [(read(first_of(env.reset(seed=seed))), 0.0, False)]
+    observation = first_of(env.reset(seed=seed))
+    seen = [(read(observation), 0.0, False)]
     for _ in range(STEPS):
         observation, reward, terminated, truncated, info = five_of(
-            env.step(env.sample() if agents else env.action_space.sample())
+            env.step(env.sample() if agents else _any_action(env, observation))
         )
         life_lost(info)  # raises where it cannot be read
         seen.append((read(observation), one_number(reward), bool(terminated or truncated)))
         if seen[-1][2]:
             break
     return seen
+
+
+def _any_action(env: Any, observation: Any) -> Any:
+    """Draws an action, a valid one if the observation holds a mask."""
+    if not mask_in(env.observation_space)[0]:
+        return env.action_space.sample()
+    from sauna.envs.masked import sample_valid
+
+    return sample_valid(env.action_space, observation["action_mask"])
 
 
 def _difference(

@@ -11,15 +11,12 @@ import numpy as np
 
 def shape_check(space: Any) -> Callable[[Any], None]:
     """Makes `check_shapes` of a space, fast if every part is an array of its shape."""
-    leaves = list(_leaves(space, ()))
+    parts = [(path, tuple(part.shape or ())) for path, part in leaves(space)]
 
     def check(observation: Any) -> None:
         try:
-            for path, shape in leaves:
-                part = observation
-                for name in path:
-                    part = part[name]
-                if part.shape != shape:
+            for path, shape in parts:
+                if part_at(observation, path).shape != shape:
                     break
             else:
                 return
@@ -30,16 +27,29 @@ def shape_check(space: Any) -> Callable[[Any], None]:
     return check
 
 
-def _leaves(space: Any, path: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], tuple[int, ...]]]:
-    """`(path, shape)` of each part that is no Dict or Tuple."""
+def leaves(space: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """`(path, space)` of each part that is no Dict or Tuple."""
     from gymnasium import spaces as gym
 
     if isinstance(space, gym.Dict | gym.Tuple):
         parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
         for name, part in parts:
-            yield from _leaves(part, (*path, name))
+            yield from leaves(part, (*path, name))
     else:
-        yield path, tuple(space.shape or ())
+        yield path, space
+
+
+def mask_in(space: Any) -> tuple[int, Any]:
+    """Entries of the action mask that observations hold (0: none), and the space of the rest."""
+    mask = getattr(space, "mask_size", 0)
+    return mask, space["observation"] if mask else space
+
+
+def part_at(observation: Any, path: tuple[Any, ...]) -> Any:
+    """The part that `leaves` gives a path for."""
+    for name in path:
+        observation = observation[name]
+    return observation
 
 
 def check_shapes(space: Any, observation: Any) -> None:

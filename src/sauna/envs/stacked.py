@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces as gym
 
-from sauna.envs.spaces import PICTURES, describe, observation_reader
+from sauna.envs.spaces import describe, observation_reader
 from sauna.system.errors import BadInput
 
 
@@ -20,7 +20,7 @@ class StackedSpace(gym.Box):
 
     def __init__(self, space: Any, action_space: Any, number: int) -> None:
         spaces = describe(space, action_space)
-        if spaces.observation_kind in PICTURES:
+        if spaces.picture_shapes:
             raise BadInput(
                 "stack: pictures are not stacked; gymnasium.wrappers.FrameStackObservation does "
                 "so, and Atari's come as four frames"

@@ -15,6 +15,7 @@ class Wrapping(NamedTuple):
 
     wrap: tuple[str, ...] = ()
     stack: int = 1
+    action_mask: bool = False
 
 
 PLAIN = Wrapping()
@@ -22,7 +23,7 @@ PLAIN = Wrapping()
 
 def wrapping_of(config: Config) -> Wrapping:
     """The wrapping that a run's settings ask for."""
-    return Wrapping(config.wrap, config.stack)
+    return Wrapping(config.wrap, config.stack, config.action_mask)
 
 
 def read_wrapping(values: Mapping[str, Any]) -> Wrapping:
@@ -39,10 +40,16 @@ def wrapped_space(env: Any, wrapping: Wrapping) -> Any:
       BadInput: a wrapper does not fit it.
     """
     space = env.observation_space
+    if getattr(space, "mask_size", 0):  # the outermost is there
+        return space
     if wrapping.stack > 1:
         from sauna.envs.stacked import stacked_space
 
         space = stacked_space(space, env.action_space, wrapping.stack)
+    if wrapping.action_mask:
+        from sauna.envs.masked import masked_space
+
+        space = masked_space(space, env.action_space)
     return space
 
 
@@ -58,6 +65,10 @@ def wrapped(env: Any, wrapping: Wrapping) -> Any:
         from sauna.envs.stacked import StackedEnv
 
         env = StackedEnv(env, wrapping.stack)
+    if wrapping.action_mask:
+        from sauna.envs.masked import MaskedEnv
+
+        env = MaskedEnv(env)
     return env
 
 

@@ -80,6 +80,8 @@ def record(
         raise BadInput(f"to: {to!r} is neither minari:NAME nor a file that ends in .parquet")
     to = to if to.startswith(MINARI) else str(Path.cwd() / to)
     artifact = load_artifact(run, say, checkpoint, trust=trust)
+    if artifact.config.action_mask:
+        raise BadInput("record: a data set has no place for action masks")
     env = provided(run, env, parts)
     name = find_member(artifact.members, 0 if member is None else member)
     kwargs, chosen = kwargs_of(artifact, env, env_kwargs), env or artifact.config.env

@@ -97,6 +97,9 @@ def clone_members(
 
 def _read(prepared: Prepared) -> Demonstrations:
     config, spaces = prepared.config, prepared.spaces
+    if spaces.mask or spaces.pictures:
+        what = "action masks" if spaces.mask else "pictures beside other observations"
+        raise BadInput(f"init_from: cloning from data does not know {what}")
     name, text = config.init_from, config.init_from.removeprefix(DATA)
     if text.startswith(MINARI):
         episodes = read_minari(text, name, spaces, config.env)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -110,6 +110,7 @@ class ActorCritic(nn.Module):
       log_std_init: start of the log-std, or None for a distribution without one.
       shared: one trunk for all heads.
       predicted: width of the auxiliary head, which stands beside the value head; 0: there is none.
+      make_cell: builds the recurrent cell behind a trunk, by its name; None: nothing is remembered.
       noise: how the log-std depends on the last hidden layer; None: it does not.
     """
 
@@ -118,16 +119,35 @@ class ActorCritic(nn.Module):
     log_std_init: float | None
     shared: bool
     predicted: int = 0
+    make_cell: Callable[[str], nn.Module] | None = None
     noise: StateNoise | None = None
 
     @nn.compact
-    def __call__(self, observation: Array) -> PolicyOutput:
-        """`[..., *obs]` -> `PolicyOutput` with leading axes `[...]`."""
+    def __call__(
+        self, observation: Array, start: Array | None = None, state: Any = ()
+    ) -> PolicyOutput:
+        """`[..., *obs]` -> `PolicyOutput` with leading axes `[...]`.
+
+        Args:
+          observation: `[L, B, *obs]`, in time order, if there are cells.
+          start: `[L, B]` bool, where an episode starts; state: `[B, H]` before the first step, the
+            policy's cell first. Of cells alone.
+        """
         first = self.make_trunk("trunk" if self.shared else "policy_trunk", self)
         policy_features = first(observation)
         value_features = (
             policy_features if self.shared else self.make_trunk("value_trunk", self)(observation)
         )
+        if self.make_cell is not None:
+            own = jnp.split(state, 1 if self.shared else 2, -1)
+            name = "cell" if self.shared else "policy_cell"
+            policy_features, state = self.make_cell(name)(policy_features, start, own[0])
+            if self.shared:
+                value_features = policy_features
+            else:
+                value_cell = self.make_cell("value_cell")
+                value_features, of_value = value_cell(value_features, start, own[1])
+                state = jnp.concatenate([state, of_value], -1)
         hidden = policy_features
         policy = dense(self.num_outputs, 0.01, "policy_head")(policy_features)
         if self.log_std_init is not None:
@@ -138,7 +158,7 @@ class ActorCritic(nn.Module):
         prediction = None
         if self.predicted:
             prediction = dense(self.predicted, 1.0, "auxiliary_head")(value_features)
-        return PolicyOutput(policy, value, vex, hidden, prediction)
+        return PolicyOutput(policy, value, vex, hidden, prediction, state)
 
     def _log_std(self, hidden: Array, first: float) -> Array:
         """The log-std `[A]`; one that depends on the state is `[..., A]`, of a matrix `[H, A]`.

@@ -15,7 +15,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from sauna.algorithm.policy.gsde import deviation
+from sauna.algorithm.policy.observation import INVALID
 from sauna.algorithm.policy.policy import Policy
+from sauna.algorithm.rollout.memory import HostMemory
 from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
@@ -62,6 +64,19 @@ class CompiledActor:
         return np.asarray(self._act(self._params, observation, noise))
 
 
+class RecurrentActor(CompiledActor):
+    """Acts by `Program.act` with the states of `memory`, and moves them on."""
+
+    def __init__(self, act: Any, memory: HostMemory) -> None:
+        super().__init__(act)
+        self._memory = memory
+
+    def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        action, state = self._act(self._params, observation, noise, self._memory.state)
+        self._memory.advance(np.asarray(state))
+        return np.asarray(action)
+
+
 class MLPActor:
     """Acts by a compiled loop, for the MLP trunks of `policy/networks.py`.
 
@@ -75,7 +90,8 @@ class MLPActor:
         self._trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
         self._function = ACTIVATIONS.index(config.activation)
         self._layers = [f"layer_{i}" for i in range(len(config.hidden))]
-        widths = [spaces.observation_shape[0], *config.hidden, policy.distribution.num_outputs]
+        widths = [spaces.numbers, *config.hidden, policy.distribution.num_outputs]
+        self._mask = spaces.mask
         self._weights = tuple(
             np.zeros((members, before + 1, after), np.float32)
             for before, after in itertools.pairwise(widths)
@@ -109,7 +125,7 @@ class MLPActor:
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
         noisy = np.empty((*noise.shape[:2], self._weights[-1].shape[-1]), np.float32)
         form = self._weights, self._norms, self._function
-        _act(observation, *form, self._hidden, noise, self._adds, noisy)
+        _act(observation, *form, self._hidden, noise, self._adds, noisy, self._mask)
         return self._sample(noisy, noise)
 
 
@@ -123,13 +139,15 @@ def _act(
     noise: Any,
     adds: int,
     noisy: Any,
+    mask: int,
 ) -> None:
     """Writes the policy head's outputs and their noise, member by member, to `noisy` `[P, N, K]`.
 
     `noise` `[P, N, M]` is added as it is, or as the last hidden layer times a matrix `[H, K]`, or
-    not at all: as `adds` says.
+    not at all: as `adds` says. The last `mask` numbers of an observation say which actions are
+    valid; 0: all are.
     """
-    last = len(weights) - 1
+    last, first = len(weights) - 1, observation.shape[2] - mask
     for p in range(observation.shape[0]):
         for n in range(observation.shape[1]):
             x = observation[p, n]
@@ -154,6 +172,9 @@ def _act(
                 for k in range(len(x)):
                     for j in range(len(y)):
                         y[j] += x[k] * noise[p, n, k * len(y) + j]
+            for j in range(mask):
+                if observation[p, n, first + j] == 0:
+                    y[j] = np.float32(INVALID)
 
 
 @compiled
@@ -284,8 +305,17 @@ def _largest(logits: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
     return np.stack([part.argmax(-1) for part in parts], -1).astype(np.int32)
 
 
-def make_actor(config: Config, spaces: Spaces, policy: Policy, act: Any, members: int) -> Actor:
-    """The fastest actor for the network of `config`."""
-    if config.network == "mlp" and len(spaces.observation_shape) == 1:
+def make_actor(
+    config: Config,
+    spaces: Spaces,
+    policy: Policy,
+    act: Any,
+    members: int,
+    memory: HostMemory | None = None,
+) -> Actor:
+    """The fastest actor for the network of `config`; `memory` is read if it is recurrent."""
+    if policy.state_size and memory is not None:
+        return RecurrentActor(act, memory)
+    if config.network == "mlp" and len(spaces.observation_shape) == 1 and not spaces.pictures:
         return MLPActor(config, spaces, policy, members)
     return CompiledActor(act)

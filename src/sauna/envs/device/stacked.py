@@ -42,4 +42,5 @@ def stacked(env: JaxEnv, number: int) -> JaxEnv:
         step=step,
         observation_space=StackedSpace(env.observation_space, env.action_space, number),
         render=of_inner(env.render),
+        action_mask=of_inner(env.action_mask),
     )

@@ -104,7 +104,7 @@ def examine(
         found = until(learned(*parts, hypers, member.seed, iteration), steps)
     end = len(decisions.keep)
     kept: Any = decisions.keep[:, None]
-    alone = Rollout(*(x[:end, :1] for x in streams))._replace(keep=kept)
+    alone: Rollout = jax.tree.map(lambda x: x[:end, :1], streams)._replace(keep=kept)
     points, shares = principal_components(played.observation)
     return Inspection(
         member=member,

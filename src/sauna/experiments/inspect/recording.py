@@ -115,6 +115,7 @@ class Recorder:
 
     def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
         observation, info = self._env.reset(seed=seed)
+        self._policy.reset()
         self._steps = 0
         self._now = self._see(observation)
         return observation, info

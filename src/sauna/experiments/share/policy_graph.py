@@ -66,12 +66,18 @@ def _check(config: Config, spaces: Spaces) -> None:
     unknown = ""
     if config.network not in NETWORKS:
         unknown = f"network {config.network}; only {' and '.join(NETWORKS)} are"
+    elif config.recurrent != "none":
+        unknown = f"recurrent {config.recurrent}"
     elif config.network == "mlp" and config.activation not in ACTIVATIONS:
         unknown = f"activation {config.activation}"
     elif config.network == "mlp" and config.layer_norm:
         unknown = "layer_norm"
     elif spaces.observation_kind not in ("vector", "one_hot", "image"):
         unknown = f"observations of kind {spaces.observation_kind}"
+    elif config.action_mask:
+        unknown = "action_mask"
+    elif spaces.pictures:
+        unknown = "pictures beside other observations"
     if unknown:
         raise BadInput(f"export: not written as ONNX or numpy: {unknown}")
 
