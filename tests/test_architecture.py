@@ -69,6 +69,7 @@ FLOORS = (
     "experiments.study",
     "experiments.tune",
     "experiments.share",
+    "experiments.check",
     "experiments",
     "api",
     "cli",

@@ -27,6 +27,7 @@ from sauna.config.presets import (
 )
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
+from sauna.experiments.check import flags as checking
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.share import flags as sharing
 from sauna.experiments.tune.flags import add_tune, tune_from_flags
@@ -194,6 +195,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     add_fields(bench, [n for n in FIELDS if n not in own], {**values, "seeds": 6})
 
     sharing.add_commands(commands)
+    checking.add_command(commands)
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
     lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
@@ -444,4 +446,5 @@ _COMMANDS = {
     "bench": _bench,
     "list": _list,
     **sharing.COMMANDS,
+    "check": checking.check_from_flags,
 }
