@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from clone_page import clone_text
-from measured_pages import noise_page, posture_page, sweep_page
+from measured_pages import fine_tuning_page, noise_page, posture_page, sweep_page
 from selection_page import CURVES as SELECTION_CURVES
 from selection_page import POINTS as SELECTION_POINTS
 from selection_page import SELECTION, selection_page
@@ -167,6 +167,8 @@ def write_pages() -> None:
     if zoo := load("zoo"):
         draw_zoo(zoo["units"], FIGURES / "zoo.svg")
         (PAGES / "zoo.md").write_text(zoo_page(zoo["units"]))
+    if found := load("fine_tuning"):
+        (PAGES / "fine_tuning.md").write_text(fine_tuning_page(found))
     if text := selection_page():
         (PAGES / "selection.md").write_text(text)
     covered = json.loads((ROOT / "results" / "intervals.json").read_text())["iqm_of_normals"]["6"]
