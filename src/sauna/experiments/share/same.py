@@ -116,7 +116,7 @@ class _Remembering:
         inner, mask = observation, None
         if "action_mask" in self._graph.arguments:
             inner, mask = observation["observation"], observation["action_mask"]
-        given = {}
+        given: dict[str, Any] = {}
         for part in self._graph.inputs:
             value = {"observation": inner, "action_mask": mask, "state": self._state}[part.argument]
             for key in part.keys:
