@@ -10,8 +10,8 @@ import numpy as np
 
 
 def shape_check(space: Any) -> Callable[[Any], None]:
-    """Makes `check_shapes` of a space, fast if every part is an array of its shape."""
-    leaves = list(_leaves(space, ()))
+    """Makes `check_shapes` of a space, fast if every part is an array of its shape, or a number."""
+    leaves = [(path, tuple(part.shape or ())) for path, part in parts_of(space)]
 
     def check(observation: Any) -> None:
         try:
@@ -19,7 +19,10 @@ def shape_check(space: Any) -> Callable[[Any], None]:
                 part = observation
                 for name in path:
                     part = part[name]
-                if part.shape != shape:
+                if type(part) is int:
+                    if shape:
+                        break
+                elif part.shape != shape:
                     break
             else:
                 return
@@ -30,16 +33,16 @@ def shape_check(space: Any) -> Callable[[Any], None]:
     return check
 
 
-def _leaves(space: Any, path: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], tuple[int, ...]]]:
-    """`(path, shape)` of each part that is no Dict or Tuple."""
+def parts_of(space: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """`(path, space)` of each part that is no Dict or Tuple, in the order of flattening."""
     from gymnasium import spaces as gym
 
     if isinstance(space, gym.Dict | gym.Tuple):
         parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
         for name, part in parts:
-            yield from _leaves(part, (*path, name))
+            yield from parts_of(part, (*path, name))
     else:
-        yield path, tuple(space.shape or ())
+        yield path, space
 
 
 def check_shapes(space: Any, observation: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.shapes import shape_check
+from sauna.envs.shapes import parts_of, shape_check
 from sauna.system.errors import BadInput
 
 SMALLEST_IMAGE = 36  # the Nature CNN's three convolutions need this many pixels
@@ -238,14 +238,59 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
         return np.asarray
 
     check = shape_check(space)
+    if isinstance(space, gym.Box):
 
-    def read(observation: Any) -> np.ndarray:
-        check(observation)
-        if isinstance(space, gym.Box):
+        def read(observation: Any) -> np.ndarray:
+            check(observation)
             return np.asarray(observation).reshape(-1)
-        return gym.flatten(space, observation)
 
-    return read
+        return read
+    return _flattener(space, check)
+
+
+def _flattener(space: Any, check: Callable[[Any], None]) -> Callable[[Any], np.ndarray]:
+    """`gymnasium.spaces.flatten` of one space, prepared: at every env step that would cost more
+    than many an environment."""
+    from gymnasium import spaces as gym
+
+    places, end = [], 0
+    for path, part in parts_of(space):
+        start, end = end, end + int(gym.utils.flatdim(part))
+        places.append((path, _part_writer(part), start, end))
+    dtype = np.result_type(*(part.dtype for _, part in parts_of(space)))
+
+    def flatten(observation: Any) -> np.ndarray:
+        check(observation)
+        vector = np.zeros(end, dtype)
+        for path, write, start, stop in places:
+            value = observation
+            for name in path:
+                value = value[name]
+            write(vector[start:stop], value)
+        return vector
+
+    return flatten
+
+
+def _part_writer(space: Any) -> Callable[[np.ndarray, Any], None]:
+    """A function that writes a value of a space into zeros, as `gymnasium.spaces.flatten` does."""
+    from gymnasium import spaces as gym
+
+    first, dtype = getattr(space, "start", 0), space.dtype
+
+    def one_hot(place: np.ndarray, value: Any) -> None:
+        place[value - first] = 1
+
+    def plain(place: np.ndarray, value: Any) -> None:
+        array = np.asarray(value, dtype)
+        place[:] = array if array.ndim == 1 else array.reshape(-1)
+
+    def any_other(place: np.ndarray, value: Any) -> None:
+        place[:] = gym.flatten(space, value)
+
+    if isinstance(space, gym.Discrete):
+        return one_hot
+    return plain if isinstance(space, gym.Box | gym.MultiBinary) else any_other
 
 
 def action_writer(space: Any, rescale: bool = False) -> Callable[[np.ndarray], Any]:
@@ -260,7 +305,7 @@ def action_writer(space: Any, rescale: bool = False) -> Callable[[np.ndarray], A
         return _box_writer(space, rescale)
     if isinstance(space, gym.Discrete):
         start = int(space.start)
-        return lambda action: int(action[0]) + start
+        return lambda action: action.item() + start
     if isinstance(space, gym.MultiDiscrete):
         starts = np.asarray(getattr(space, "start", 0))
         return lambda action: (action + starts).astype(space.dtype)
