@@ -22,13 +22,14 @@ from typing import Any
 
 import numpy as np
 from clone_page import clone_text
-from measured_pages import noise_page, posture_page, sweep_page
+from measured_pages import fine_tuning_page, noise_page, posture_page, sweep_page
 from selection_page import CURVES as SELECTION_CURVES
 from selection_page import POINTS as SELECTION_POINTS
 from selection_page import SELECTION, selection_page
 from studies import MEASURED, ROOT, STUDIES, load, page_of
 from study_pages import pong_text, ppo_page, study_page
 from summary_page import findings, index
+from tune_page import tune_text
 from zoo_page import draw_zoo, zoo_page
 
 from sauna.experiments.report.figures import draw_plots, write_figures
@@ -166,6 +167,8 @@ def write_pages() -> None:
     if zoo := load("zoo"):
         draw_zoo(zoo["units"], FIGURES / "zoo.svg")
         (PAGES / "zoo.md").write_text(zoo_page(zoo["units"]))
+    if found := load("fine_tuning"):
+        (PAGES / "fine_tuning.md").write_text(fine_tuning_page(found))
     if text := selection_page():
         (PAGES / "selection.md").write_text(text)
     covered = json.loads((ROOT / "results" / "intervals.json").read_text())["iqm_of_normals"]["6"]
@@ -177,6 +180,8 @@ def write_pages() -> None:
     if clones := load("clone"):
         text = clone_text(clones["tasks"])
         insert(ROOT / "docs" / "how-to" / "record_and_clone.md", "clone", text)
+    if tuned := load("tune"):
+        insert(ROOT / "docs" / "how-to" / "tune.md", "tune", tune_text(tuned))
     if results := load("pong"):
         insert(ROOT / "docs" / "how-to" / "atari.md", "pong", pong_text(results))
 

@@ -205,3 +205,19 @@ def posture_answer(measured: Mapping[str, Any]) -> str:
     if pair.p < ALPHA:
         word = "yes" if pair.gained > pair.lost else "no"
     return f"**{word}**: {counts[0]} against {counts[1]}"
+
+
+def fine_tuning_page(found: Mapping[str, Any]) -> str:
+    """What a run that starts from the weights of another gains, `results/fine_tuning.json`."""
+    rows = [["Training", "Return of each seed", "Mean", "Mean episode length"]]
+    for arm, unit in found["arms"].items():
+        shown = ", ".join(f"{value:,.0f}" for value in unit["returns"])
+        mean, length = np.mean(unit["returns"]), np.mean(unit["lengths"])
+        rows.append([arm, shown, f"{mean:,.0f}", f"{length:,.0f}"])
+    return page(
+        "fine_tuning",
+        steps=f"{found['steps']:,}",
+        episodes=found["episodes"],
+        table=markdown(rows),
+        commands="\n".join(unit["command"] for unit in found["arms"].values()),
+    )

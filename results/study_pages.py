@@ -106,6 +106,7 @@ def overview(results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
 def _column(task: str) -> str:
     """A task's name, which may break at its capitals."""
     name = unversioned(task).removeprefix("gymnax/").removesuffix("-MinAtar")
+    name = name.removeprefix("sauna.envs.memory_tasks:")
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "&shy;", name)
 
 

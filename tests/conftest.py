@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Generator
 from contextlib import nullcontext
+from unittest.mock import patch
 
 import pytest
 
@@ -57,9 +58,13 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Trains in threads, unless the test is about processes; `tests/faults` chooses for itself."""
-    real = "faults" in item.path.parts or item.get_closest_marker("processes")
-    with nullcontext() if real else trained_here():
+    """Trains in threads, unless the test is about processes, and draws no learning curve, unless
+    the test is about that; `tests/faults` chooses for itself."""
+    own_choice = "faults" in item.path.parts
+    real = own_choice or item.get_closest_marker("processes")
+    drawn = own_choice or item.get_closest_marker("draws")
+    undrawn = nullcontext() if drawn else patch("sauna.api.draw_curve", lambda run: None)
+    with nullcontext() if real else trained_here(), undrawn:
         return (yield)
 
 

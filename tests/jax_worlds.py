@@ -202,3 +202,22 @@ by_numpy = StepFilter(
     lambda s, step, k, h: (s + step.vex, step.vex >= s),
 )
 summed = VexTarget(lambda return_, value, weight, episode: jnp.sum(return_ - value))
+
+
+def _valid(state: State) -> jax.Array:
+    """Of two components: 3 and 2 choices, which of them depends on the step."""
+    t = state.steps
+    return jnp.stack([t % 3 == 0, t % 3 != 0, t % 2 == 0, t % 2 == 0, t % 2 != 0])
+
+
+def _masked_step(state: State, action: jax.Array) -> Transition:
+    told = step(state, 0.1 * action[:1])
+    taken = jnp.stack([action[0], 3 + action[1]])
+    return told._replace(info={"invalid": jnp.any(~_valid(state)[taken])})
+
+
+# The walk by choices, of which some are valid; an episode's last step says whether its was not.
+choosy = JaxEnv(reset, _masked_step, _BOX, gymnasium.spaces.MultiDiscrete([3, 2]))
+choosy = choosy._replace(action_mask=_valid)
+# The same, in whose fourth state no action is valid.
+stuck = choosy._replace(action_mask=lambda state: _valid(state) & (state.steps != 3))

@@ -15,8 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from sauna.algorithm.learner import program as learning
 from sauna.algorithm.learner.program import Learner
+from sauna.algorithm.policy import policy as policies
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import program as collecting
 from sauna.algorithm.rollout.program import Program
@@ -72,6 +75,17 @@ def forget() -> None:
 def share_programs() -> None:
     """Lets modules that are imported from now on share what they compile."""
     make_program, make_learner = collecting.make_program, learning.make_learner
+    make_policy = policies.make_policy
+
+    def policy(config: Config, spaces: Spaces) -> Policy:
+        """Its parameters are drawn by one program rather than operation by operation."""
+        if _may_change(config):
+            return make_policy(config, spaces)
+        key = ("policy", *_key(config, spaces))
+        if key not in _made:
+            made = make_policy(config, spaces)
+            _made[key] = made._replace(init=jax.jit(made.init))
+        return _made[key]
 
     def program(config: Config, spaces: Spaces) -> Program:
         if _may_change(config):
@@ -90,4 +104,5 @@ def share_programs() -> None:
         return _made[key][1]
 
     collecting.make_program, learning.make_learner = program, learner
+    policies.make_policy = policy
     device.make_population = partial(_population, device.make_population)

@@ -24,6 +24,7 @@ from sauna.training.artifact import load_artifact
 from worlds import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
+pytestmark = pytest.mark.draws
 
 
 class Listed(sauna.Tracker):
@@ -295,7 +296,8 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
     (tmp_path / "my_filters.py").write_text(code)
     command = next(line for line in text.splitlines() if line.startswith("sauna train"))
-    arguments = [*command.split()[1:], "--out", "run", "--steps", "4096", "--seeds", "2"]
+    arguments = [*command.split()[1:], "--out", "run", "--seeds", "2"]
+    arguments += ["--rollout-steps", "512", "--steps", "1024"]
     done = sauna_here(*arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rates = [row["keep_rate"] for row in run_directory.rows(tmp_path / "run")]

@@ -6,7 +6,7 @@ import itertools
 import os
 import signal
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -137,6 +137,23 @@ class Scripted(World):
 
     def truncated(self) -> bool:
         return self.cut and self.t >= self.end
+
+
+class Boxed(Scripted):
+    """Actions in a box that is not [-1, 1]; notes what it gets."""
+
+    action_space = spaces.Box(-3.0, 1.0, (2,), np.float32)
+    seen_actions: ClassVar[list[np.ndarray]] = []
+
+    def reward(self, action: Any) -> float:
+        self.seen_actions.append(np.array(action))
+        return super().reward(action)
+
+
+class Unbounded(Scripted):
+    """Actions with one bound missing."""
+
+    action_space = spaces.Box(np.array([-1.0, -1.0]), np.array([1.0, np.inf]), dtype=np.float64)
 
 
 class Informative(Scripted):
@@ -502,6 +519,49 @@ class Parts(World):
     def observe(self) -> Any:
         hand = (1 + self.t % 5, np.array([1, 0], np.int8))
         return {"hand": hand, "speed": np.array([0.5, -0.5], np.float32)}
+
+
+class Choosy(World):
+    """Takes valid actions alone, and raises at any other; which are valid changes at random.
+
+    Args:
+      several: an action has two components, of 3 and 2 choices; else one of 5.
+      by: how the mask is said, `method` or `info`.
+      wrong: at the third step of an episode the mask is this.
+    """
+
+    observation_space = spaces.Box(-1, 1, (3,), np.float32)
+    length = 6
+
+    def __init__(self, several: bool = False, by: str = "info", wrong: Any = "") -> None:
+        self.sizes = (3, 2) if several else (5,)
+        self.action_space = spaces.MultiDiscrete((3, 2)) if several else spaces.Discrete(5, start=1)
+        self.several, self.wrong = several, wrong
+        if by == "method":
+            self.action_masks = lambda: self.valid
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        seen, _ = super().reset(seed=seed)
+        return seen, {"action_mask": self.valid}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        taken = action if self.several else [action - 1]
+        starts = np.cumsum((0, *self.sizes))[:-1]
+        assert self.valid[starts + taken].all(), f"{action} is not valid"
+        *step, _ = super().step(action)
+        mask = None if self.wrong == "missing" and self.t == 3 else self.valid
+        return *step, {"action_mask": mask}  # type: ignore[return-value]
+
+    def observe(self) -> np.ndarray:
+        parts = []
+        for size in self.sizes:
+            part = self.np_random.integers(0, 2, size)
+            part[self.np_random.integers(size)] = 1
+            parts.append(part)
+        self.valid = np.concatenate(parts).astype(np.int8)
+        if self.wrong == "empty" and self.t == 3:
+            self.valid[: self.sizes[0]] = 0
+        return self.np_random.uniform(-1, 1, 3).astype(np.float32)
 
 
 def make_vector(number: int = 2) -> Any:

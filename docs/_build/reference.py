@@ -22,7 +22,7 @@ from sauna.config.fields import GROUPS
 from sauna.config.settings import FIELDS, TYPES, flag
 
 MARK = re.compile(r"<!-- generated: (\w+) -->")
-API_ORDER = ("train", "resume", "load", "evaluate", "compare", "inspect", "export", "Result")
+API_ORDER = ("train", "resume", "load", "evaluate", "compare", "inspect", "export", "push", "pull", "Result")
 POLICY = "sauna.experiments.evaluate.policy.TrainedPolicy"
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sauna.experiments.evaluate.episodes import evaluate
     from sauna.experiments.inspect.command import inspect
     from sauna.experiments.record import record
+    from sauna.experiments.share.exchange import pull, push
     from sauna.experiments.share.export import export
     from sauna.system.errors import BadInput, SaunaError
     from sauna.training.tracking.tracker import TrackedRun, Tracker
@@ -55,6 +56,8 @@ __all__ = [
     "export",
     "inspect",
     "load",
+    "pull",
+    "push",
     "record",
     "resume",
     "train",
@@ -74,6 +77,8 @@ _HOMES = {
     "Tracker": "sauna.training.tracking.tracker",
     "evaluate": "sauna.experiments.evaluate.episodes",
     "export": "sauna.experiments.share.export",
+    "pull": "sauna.experiments.share.exchange",
+    "push": "sauna.experiments.share.exchange",
     "inspect": "sauna.experiments.inspect.command",
     "record": "sauna.experiments.record",
     **dict.fromkeys(

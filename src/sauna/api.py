@@ -288,6 +288,6 @@ def load(
 
 def _named(name: str, value: Any) -> Any:
     """Names a part that was passed by value; other values stay."""
-    if name == "track" and value is not None and not isinstance(value, str):
+    if name in ("track", "wrap") and value is not None and not isinstance(value, str):
         return [name_of(one) for one in (value if isinstance(value, list | tuple) else [value])]
     return name_of(value) if name in PARTS and value is not None else value

@@ -1,4 +1,4 @@
-"""The command line: `sauna train | resume | eval | inspect | compare | plot | runs | study | ...`.
+"""The command line: `sauna train | resume | eval | inspect | compare | tune | plot | runs | ...`.
 
 Flags and help lines are made from `Config`'s fields. argparse rather than a larger parser: it
 starts in milliseconds, and a mistake can be answered with one line.
@@ -27,13 +27,16 @@ from sauna.config.presets import (
 )
 from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
 from sauna.config.stored import read_stored
+from sauna.experiments.check import flags as checking
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.share import flags as sharing
+from sauna.experiments.tune.flags import add_tune, tune_from_flags
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
 
-LISTS = ("envs", "atari", *NATIVE, "arms", "rules", "presets", "filters", "targets", "studies")
+_CHOICES = ("arms", "rules", "presets", "filters", "targets", "studies")
+LISTS = ("zoo", "envs", "atari", *NATIVE, *_CHOICES)
 # Where a comparison or a study trains.
 _PLACE: dict[str, dict[str, Any]] = {
     "out": {
@@ -158,6 +161,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
         for name, how in _PLACE.items():
             place.add_argument(flag(name), **how)
 
+    add_tune(commands, values, _PLACE)
+
     text = "draw the learning curves of runs that exist: run directories, CSV, TensorBoard files"
     plot = commands.add_parser("plot", help=text, allow_abbrev=False)
     text = "a run directory, a CSV file (seed, step, return), or TensorBoard files or their folder"
@@ -190,6 +195,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     add_fields(bench, [n for n in FIELDS if n not in own], {**values, "seeds": 6})
 
     sharing.add_commands(commands)
+    checking.add_command(commands)
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
     lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
@@ -433,10 +439,12 @@ _COMMANDS = {
     "record": _record,
     "inspect": _inspect,
     "compare": _compare,
+    "tune": lambda values: tune_from_flags(values, _say),
     "plot": _plot,
     "runs": _runs,
     "study": _study,
     "bench": _bench,
     "list": _list,
     **sharing.COMMANDS,
+    "check": checking.check_from_flags,
 }

@@ -38,6 +38,7 @@ def test_a_field_that_nothing_reads_is_refused_with_what_would_read_it(name: str
         normalize_advantages=False,
         advantage_sign="positive" if name == "normalize_advantages" else "both",
         learning_rate_schedule="constant" if kl else "kl",
+        distribution="beta" if name in ("log_std_init", "rescale_actions") else "gaussian",
     )
     needed = FIELDS[name].metadata["read_when"][0]
     assert not is_read(name, unread)

@@ -35,7 +35,7 @@ LANGUAGES = {"bash", "python", "toml", "text"}
 # Commands that are parsed but not run: they need games, a cluster, a browser or hours.
 NOT_RUN = re.compile(
     r"ALE/|playground/|Flagrun|LunarLander|--distributed|--on ray|^sauna (study|bench|list)|--v"
-    r"|compare (?!InvertedPendulum)|plot runs/ppo"
+    r"|^sauna tune|compare (?!InvertedPendulum)|plot runs/ppo|tuned\.json"
 )
 EXAMPLE_MODULE = """
 import gymnasium

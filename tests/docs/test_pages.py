@@ -38,6 +38,15 @@ def test_the_docs_stay_small() -> None:
     assert sum(path.stat().st_size for path in DOCS.rglob("*") if path.is_file()) < 3e6
 
 
+def test_each_of_our_cells_beside_other_libraries_has_a_recipe_and_a_test() -> None:
+    page = (DOCS / "start" / "libraries.md").read_text()
+    rows = [line.split(" | ") for line in page.splitlines() if line.count(" | ") == 8]
+    ours = [(cells[1], cells[2].strip("` ")) for cells in rows if cells[1] not in ("SAUNA", "---")]
+    assert len(ours) > 25
+    for cell, test in ours:
+        assert cell == "no" or (re.search(r"]\(\.\./[\w/-]+\.md", cell) and (ROOT / test).is_file())
+
+
 def test_every_page_is_in_the_navigation() -> None:
     listed = set(re.findall(r"([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
     assert listed == {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import jax
@@ -60,7 +61,7 @@ def test_observations_are_the_numbers_by_hand_on_host_and_device(space, value, e
 
 
 REFUSED = [
-    (gym.Dict({"state": box(4), "camera": box(84, 84, 3, dtype=np.uint8)}), "['camera']"),
+    (gym.Dict({"state": box(4), "camera": box(84, 84, 3)}), "['camera']"),
     (gym.Dict({"far": gym.Tuple((box(1), box(3, 64, 64)))}), "['far'][1]"),
     (gym.Dict({"goal": gym.Text(4)}), "['goal']: Text is not supported"),
     (gym.Tuple((TWO, gym.Sequence(box(1)))), "[1]: Sequence is not supported"),
@@ -80,12 +81,43 @@ def test_what_would_become_a_long_vector_is_refused_with_what_to_do(space, words
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
+def test_pictures_in_a_dict_stand_behind_the_numbers_on_host_and_device() -> None:
+    space = gym.Dict(
+        {
+            "camera": box(40, 36, 3, dtype=np.uint8, high=255),
+            "deep": gym.Tuple((gym.Discrete(2), box(2, 36, 40, dtype=np.uint8, high=9))),
+            "map": box(5, 5, dtype=np.uint8, high=255),
+            "state": box(2),
+        }
+    )
+    found, one = describe(space, TWO), space.sample()
+    numbers = [*np.eye(2)[one["deep"][0]], *one["map"].ravel(), *one["state"]]
+    assert (found.observation_kind, found.numbers, found.normalized) == ("vector", 29, 29)
+    assert found.pictures == ((40, 36, 3, 255.0), (36, 40, 2, 9.0)) and found.is_combined
+    seen = observation_reader(space)(one)
+    assert seen.shape == found.observation_shape == (29 + 40 * 36 * 3 + 36 * 40 * 2,)
+    np.testing.assert_array_equal(seen[:29], numbers)
+    stack = np.moveaxis(one["deep"][1], 0, -1)  # frames in front, as a picture alone has it
+    np.testing.assert_array_equal(seen[29:], [*one["camera"].ravel(), *stack.ravel()])
+    np.testing.assert_array_equal(jax.jit(_reader(space))(one), seen.astype(np.float32))
+    assert read_spaces(json.loads(json.dumps(list(found)))) == found
+
+
+@pytest.mark.parametrize(
+    "changed", [{"pictures": ((1, 2, -1, 1.0),)}, {"mask": 40}, {"pictures": ((9, 9, 9, 1.0),)}]
+)
+def test_parts_without_a_place_are_no_spaces(changed: dict[str, Any]) -> None:
+    spaces = describe(box(30), TWO)
+    with pytest.raises(ValueError):
+        read_spaces(list(spaces._replace(**changed)))
+
+
 def test_small_boards_and_masks_are_images_that_know_their_highest_byte() -> None:
     for high, shape in ((3, (5, 5)), (1, (48, 48, 2)), (255, (40, 40, 3))):
         found = describe(box(*shape, dtype=np.uint8, high=high), TWO)
         assert (found.observation_kind, found.observation_high) == ("image", high)
         assert found.observation_shape == (*shape, 1)[:3]
-    stored = list(found)[:-1]  # as runs before have it
+    stored = list(found)[:-4]  # as runs before have it
     assert read_spaces(stored) == found
 
 

@@ -121,6 +121,8 @@ def scored(vex: np.ndarray) -> ScoredStep:
 def test_lost_lives_and_signs_are_what_is_learned() -> None:
     """Three lives of two steps in one game, rewards 5 and -3."""
     policy: Any = SimpleNamespace(
+        reset=lambda: None,
+        policy=SimpleNamespace(state_size=0),
         see=np.asarray,
         act=lambda observation, deterministic, key: np.array([1]),
         write=lambda action: action[0],
@@ -249,7 +251,7 @@ def test_advantages_over_kept_steps_are_the_updates() -> None:
         "keep": keep,
         "valid": np.ones((length, 1), bool),
     }
-    stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields))
+    stream = Rollout(*(columns.get(name, zeros) for name in Rollout._fields[:-1]))
     hypers = hypers_of(config)
     update = jax.jit(partial(make_batch, config=config, target=make_target(config)))
     batch = update(stream, hypers, jax.random.key(0))
@@ -271,13 +273,14 @@ def test_principal_components() -> None:
     np.testing.assert_allclose(line, [[-1.5, 0], [-0.5, 0], [0.5, 0], [1.5, 0]], atol=1e-12)
 
 
-def test_principal_components_of_many_pictures_are_those_of_some_pixels() -> None:
-    seen = np.zeros((400, 84, 84, 4), np.uint8)
-    seen[:200, ::2] = 255
+def test_principal_components_of_many_pictures_are_those_of_some_pixels(monkeypatch) -> None:
+    monkeypatch.setattr("sauna.experiments.inspect.inspection.LARGEST", 1_000_000)
+    seen = np.zeros((40, 84, 84, 4), np.uint8)
+    seen[:20, ::2] = 255
     assert pixel_stride(seen) == 2
     points, shares = principal_components(seen)
     assert points is not None and shares[0] == pytest.approx(1.0)
-    assert len(np.unique(np.sign(points[:200, 0]))) == len(np.unique(np.sign(points[200:, 0]))) == 1
+    assert len(np.unique(np.sign(points[:20, 0]))) == len(np.unique(np.sign(points[20:, 0]))) == 1
 
 
 def test_pictures_are_few_small_and_of_their_steps(run) -> None:

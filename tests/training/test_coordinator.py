@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from helpers import SMALL
+from sauna.system import checkpoint, run_directory
 from sauna.system.errors import SaunaError
+from sauna.training import run as runs
 from sauna.training.coordinator import Coordinator
+from sauna.training.display import PlainDisplay
+from sauna.training.train import train_run
 
 
 class Part:
@@ -61,3 +67,25 @@ def test_nobody_has_to_read_what_is_said(monkeypatch: pytest.MonkeyPatch) -> Non
     with made:
         pass
     assert [part.ended for part in parts] == [1] * 5
+
+
+@pytest.mark.parametrize(
+    "env", ["worlds:MatchingAction", pytest.param("jax_worlds:walk", marks=pytest.mark.slow)]
+)
+def test_a_run_that_pauses_is_saved_there_and_goes_on_to_the_same_bytes(
+    env: str, tmp_path: Path
+) -> None:
+    files = []
+    for name, pauses in (("whole", ()), ("paused", (2,))):
+        settings = {"env": env, **SMALL, "seeds": 2, "processes": 2, "out": str(tmp_path / name)}
+        run, resume = runs.start(settings, PlainDisplay()), False
+        for until in (*pauses, None):
+            train_run(run, PlainDisplay(), resume=resume, until=until)
+            assert run_directory.is_complete(run.path) == (until is None)
+            newest = checkpoint.load_newest(run.path / "checkpoints", print)
+            assert newest is not None
+            assert until in (None, newest.manifest["iteration"])
+            run, resume = runs.reopen(run.path, {}, PlainDisplay()), True
+        run.lock.close()
+        files.append((run.path / "metrics.jsonl").read_bytes())
+    assert files[0] == files[1]

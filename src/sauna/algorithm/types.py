@@ -38,7 +38,7 @@ class Rollout(NamedTuple):
     """
 
     observation: Array  # [S, N, ...] normalised float32, or uint8 images
-    action: Array  # [S, N, A] float32 (continuous, unclipped) or int32
+    action: Array  # [S, N, A] float32 (unclipped, or before the tanh of a bounded one) or int32
     log_prob: Array  # [S, N] float32
     reward: Array  # [S, N] float32, normalised
     value: Array  # [S, N] float32, V(s_t) at collection
@@ -48,6 +48,18 @@ class Rollout(NamedTuple):
     truncated: Array  # [S, N] bool
     valid: Array  # [S, N] bool
     keep: Array  # [S, N] bool, the filter's decision; False on padding
+    memory: Any = None  # `Memory` of a recurrent policy
+
+
+class Memory(NamedTuple):
+    """What a recurrent policy's chunks of a rollout begin with, C chunks of L env steps each.
+
+    Truncated back-propagation through time begins anew with each chunk (Williams & Peng 1990). JAX
+    arrays, or numpy's on their way there.
+    """
+
+    start: Any  # [S, N] bool, whether an episode starts with the row
+    state: Any  # [C, N, H] float32 before each chunk's first row, as it was while acting
 
 
 class Batch(NamedTuple):
@@ -64,6 +76,8 @@ class Batch(NamedTuple):
     vex: Any = None  # [T * N] the Vex head at collection, for rules of selection
     next_observation: Any = None  # [T * N, ...] for the auxiliary head
     next_weight: Any = None  # [T * N] 1, or 0 if the next observation is not of this episode
+    row: Any = None  # [T * N] int32, place t * N + n in the rollout; None if nothing asks for it
+    memory: Any = None  # `Memory` of sequences; see `learner/sequences.py`
     importance: Any = None  # [T * N] multiplies the policy term of a replayed step; None: 1
 
 
@@ -92,6 +106,7 @@ class PolicyOutput(NamedTuple):
     vex: Array  # [...]
     hidden: Array  # [..., H] the policy's last hidden layer
     prediction: Any  # [..., O] of the auxiliary head; None if there is none
+    state: Any = ()  # [B, H] of a recurrent policy, after the last step; else ()
 
 
 class Keys(NamedTuple):
@@ -159,6 +174,7 @@ class SamplerSetup(NamedTuple):
     action_kind: str
     action_sizes: tuple[int, ...]
     replay_rollouts: int = 0
+    distribution: str = "gaussian"  # of continuous actions
 
     @property
     def rows(self) -> int:

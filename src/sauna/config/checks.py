@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from sauna.config import readers
 from sauna.config.plugins import import_name, is_local
 from sauna.config.settings import FIELDS, Config, fields_with
 from sauna.system.errors import BadInput
@@ -107,8 +109,25 @@ def check_consistent(config: Config) -> None:
         raise BadInput("env_processes: more worker processes than environments")
     check_rate(config)
     check_rules(config)
+    check_recurrent(config)
     for name in own_parts(config):
         import_name(name, getattr(config, name))
+    for path in config.wrap:
+        check_wrapper(path)
+
+
+def check_wrapper(path: str) -> None:
+    """Refuses a wrapper that no worker could import and call.
+
+    Raises:
+      BadInput: it is none; naming it.
+    """
+    if ":" not in path:
+        raise BadInput(f"wrap: {path!r} is no module:function")
+    if is_local(path):
+        raise BadInput("wrap: a wrapper has to be importable; put it at the top level of a module")
+    if not callable(import_name("wrap", path)):
+        raise BadInput(f"wrap: {path} cannot be called with an environment")
 
 
 def check_rate(config: Config) -> None:
@@ -156,6 +175,7 @@ def check_rules(config: Config) -> None:
             if getattr(config, name) != plain and (name != "control" or config.filter != "none"):
                 raise BadInput(f"{name}: needs gae_over=all")
     check_passes(config)
+    check_distribution(config)
     if config.replay_rollouts:
         check_replay(config)
     if config.normalize_over == "kept" and config.sampler == "none":
@@ -167,13 +187,37 @@ def check_rules(config: Config) -> None:
         )
 
 
+def check_distribution(config: Config) -> None:
+    """Refuses rules that need a formula which the actions' distribution lacks.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.distribution == "gsde" and config.sampler == "gradient-norm":
+        raise BadInput(
+            "sampler: gradient-norm has no formula for the gradient of distribution gsde; it has "
+            "one for gaussian, squashed and beta"
+        )
+    whole = json.loads(config.loss_weight_kwargs).get("on") == "all"
+    if config.distribution == "beta" and config.loss_weight == "delight" and not whole:
+        raise BadInput(
+            "loss_weight: delight weighs the gradient of the mean, which distribution beta has "
+            'no parameter for; loss_weight_kwargs {"on": "all"} weighs it whole'
+        )
+
+
 def check_replay(config: Config) -> None:
     """Refuses what cannot learn from earlier rollouts.
 
     Raises:
       BadInput: with the one line that says which.
     """
-    plain = {"gae_over": "all", "critic": "squared", "recompute_advantages": False}
+    plain = {
+        "gae_over": "all",
+        "critic": "squared",
+        "recompute_advantages": False,
+        "recurrent": "none",
+    }
     for name, value in plain.items():
         if getattr(config, name) != value:
             raise BadInput(f"replay_rollouts: not read with {name} {getattr(config, name)}")
@@ -198,6 +242,38 @@ def check_passes(config: Config) -> None:
             raise BadInput("loss_weight: sample-dropout needs a ratio other than 1; A2C's is 1")
     if config.recompute_advantages and (config.algorithm == "a2c" or config.epochs == 1):
         raise BadInput("recompute_advantages: needs more than one epoch")
+
+
+def check_recurrent(config: Config) -> None:
+    """Refuses what a recurrent policy cannot be trained with.
+
+    Raises:
+      BadInput: with the one line that says which.
+    """
+    if config.recurrent == "none":
+        return
+    length, batch = config.sequence_length, config.rollout_steps * config.envs
+    if config.rollout_steps % length:
+        raise BadInput(
+            f"sequence_length: {length} does not divide rollout_steps {config.rollout_steps}"
+        )
+    if (batch // length) % config.minibatches:
+        raise BadInput(
+            f"minibatches: {config.minibatches} does not divide the {batch // length} sequences of "
+            f"{length} steps in a rollout"
+        )
+    if readers.CLONED[1](config):
+        raise BadInput("init_from: recorded episodes are cloned step by step; use recurrent none")
+    if config.loss_weight != "none" and config.control == "random":
+        raise BadInput(
+            "control: the random control of a loss_weight needs a minibatch in random order, and "
+            "with recurrent its rows stand in sequences; use reversed"
+        )
+    if config.auxiliary == "shuffled-observation":
+        raise BadInput(
+            "auxiliary: shuffled-observation needs a minibatch in random order, and with recurrent "
+            "its rows stand in sequences; use next-observation"
+        )
 
 
 def local_parts(config: Config) -> list[str]:

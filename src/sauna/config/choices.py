@@ -15,6 +15,8 @@ SAMPLERS = (
     "vex-oracle",
 )
 VEX_TARGETS = ("rollout", "minibatch", "episode", "sample")
+DISTRIBUTIONS = ("gaussian", "squashed", "beta", "gsde")
+BOUNDED = ("squashed", "beta")  # actions inside the bounds of their box by themselves
 ACTIVATIONS = (
     "tanh",
     "relu",

@@ -156,14 +156,51 @@ class Config(RunOptions):
     trunk: str = _network(
         "separate", "whether policy and value share a trunk", choices=("separate", "shared")
     )
+    recurrent: str = _network(
+        "none",
+        "a cell behind each trunk that remembers what an episode has shown",
+        choices=("none", "lstm", "gru"),
+    )
+    recurrent_width: int = _network(
+        64, "width of that cell", at_least=1, read_when=readers.RECURRENT
+    )
+    sequence_length: int = _network(
+        16,
+        "env steps over which gradients flow back through it: minibatches are made of sequences",
+        at_least=1,
+        read_when=readers.RECURRENT,
+    )
+    distribution: str = _network(
+        "gaussian",
+        "of continuous actions: a Gaussian, clipped; one under a tanh (squashed) or a Beta on the "
+        "bounds of the action box; or a Gaussian whose noise depends on the state (gsde)",
+        choices=choices.DISTRIBUTIONS,
+        needs_spaces=readers.CONTINUOUS,
+    )
     log_std_init: float = _network(
-        0.0, "first log standard deviation of continuous actions", needs_spaces=readers.CONTINUOUS
+        0.0,
+        "first log standard deviation of continuous actions (gsde: of features of size 1)",
+        needs_spaces=readers.CONTINUOUS,
+        read_when=readers.LOG_STD,
+    )
+    sde_sample_freq: int = _network(
+        0,
+        "gsde: env steps for which a draw of the noise is kept (0: the whole rollout)",
+        at_least=0,
+        read_when=readers.GSDE,
+    )
+    sde_expln: bool = _network(
+        False, "gsde: a log standard deviation above 0 grows slowly", read_when=readers.GSDE
+    )
+    sde_learn_features: bool = _network(
+        False, "gsde: the noise's gradient goes into the features, too", read_when=readers.GSDE
     )
     rescale_actions: bool = _normalisation(
         True,
         "stretch actions in [-1, 1] to the bounds of the action box (MuJoCo's tasks: no, as "
         "published)",
         needs_spaces=readers.CONTINUOUS,
+        read_when=readers.UNBOUNDED,
     )
     normalize_observations: bool = _normalisation(
         True,

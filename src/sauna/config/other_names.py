@@ -67,6 +67,7 @@ SAME = {
     "critic_hidden_dims": "value_hidden",
     "activation_fn": "activation",
     "init_noise_std": "log_std_init",
+    "use_expln": "sde_expln",
     "norm_obs": "normalize_observations",
     "empirical_normalization": "normalize_observations",
     "normalize_obs": "normalize_observations",
@@ -76,6 +77,9 @@ SAME = {
     "reward_scaling": "normalize_rewards",
     "clip_obs": "clip_observations",
     "clip_reward": "clip_rewards",
+    "frame_stack": "stack",
+    "n_stack": "stack",
+    "env_wrapper": "wrap",
     "episode_length": "env_kwargs",
     "action_repeat": "env_kwargs",
     "tensorboard": "track",
@@ -106,7 +110,8 @@ ADVICE = {
     "torch_deterministic": "a run repeats itself to the bit by itself",
     "log_interval": "every iteration has its rows in metrics.jsonl and metrics.csv",
     "verbose": "`quiet=True` in Python shows nothing",
-    "use_sde": "there is no state-dependent exploration here",
+    "use_sde": "give distribution gsde: state-dependent exploration",
+    "squash_output": "give distribution squashed: a Gaussian under a tanh",
     "policy": "the policy follows from the spaces; `network` chooses its trunk",
 }
 ACCEPTED = ("seed", "batch_size", "target_kl")

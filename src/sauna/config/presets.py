@@ -20,6 +20,7 @@ from sauna.config.arms import FIXED as FIXED
 from sauna.config.arms import RANDOM_CONTROL as RANDOM_CONTROL
 from sauna.config.arms import RULE_HELP as RULE_HELP
 from sauna.config.checks import check_consistent, check_read, is_read
+from sauna.config.choices import BOUNDED
 from sauna.config.other_names import key_hint
 from sauna.config.settings import FIELDS, Config, fields_with, parse
 from sauna.config.task_presets import TASK_PRESET_HELP, TASK_PRESETS
@@ -248,6 +249,8 @@ def arm_config(arm: str, parsed: Mapping[str, Any]) -> Config:
     if entry := entry_for(parsed):
         of_env["steps"] = entry.steps
     settings = {**of_env, **PRESETS[preset], **arm_settings(arm), **free, "preset": preset}
+    if settings.get("distribution") in BOUNDED:
+        settings["rescale_actions"] = True
     return dataclasses.replace(Config(), **settings)
 
 

@@ -5,6 +5,8 @@ Of a `Config`, or of an environment's `Spaces` for `needs_spaces`; see `fields.o
 
 from __future__ import annotations
 
+from sauna.config.choices import BOUNDED
+
 ON_HOST = ("environments on the host", lambda c: c.backend != "device")
 WORKERS = ("env_processes above 0", lambda c: c.env_processes > 0)
 TRACKED = ("track", lambda c: c.track != ("none",))
@@ -18,14 +20,25 @@ NO_KL_RATE = (
 )
 ENTROPY = ("entropy_coef above 0", lambda c: c.entropy_coef > 0)
 MLP = ("the mlp network", lambda c: c.network in ("auto", "mlp"))
+RECURRENT = ("recurrent lstm or gru", lambda c: c.recurrent != "none")
 VALUE_MLP = (
     "the mlp network with trunk separate",
     lambda c: c.network in ("auto", "mlp") and c.trunk == "separate",
 )
 CONTINUOUS = ("continuous actions", lambda spaces: spaces.action_kind == "continuous")
+CHOICES = (
+    "Discrete or MultiDiscrete actions",
+    lambda spaces: spaces.action_kind in ("discrete", "multi_discrete"),
+)
+LOG_STD = ("a distribution other than beta", lambda c: c.distribution != "beta")
+GSDE = ("distribution gsde", lambda c: c.distribution == "gsde")
+UNBOUNDED = (
+    "distribution gaussian or gsde: the others are stretched to the bounds by themselves",
+    lambda c: c.distribution not in BOUNDED,
+)
 VECTORS = (
     "vector observations: others have no running moments",
-    lambda spaces: spaces.observation_kind == "vector",
+    lambda spaces: spaces.normalized > 0,
 )
 NORMALIZED = ("normalize_observations", lambda c: c.normalize_observations)
 SCALED = ("normalize_rewards", lambda c: c.normalize_rewards)

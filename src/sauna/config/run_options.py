@@ -29,6 +29,20 @@ class RunOptions:
         decided_by_study=True,
     )
     env_kwargs: str = _task("{}", "keyword arguments of the environment, as a JSON object")
+    wrap: tuple[str, ...] = _task(
+        (),
+        "module:function, ...: each takes an environment and gives one, the first the innermost",
+        read_when=readers.ON_HOST,
+    )
+    stack: int = _task(
+        1, "how many of the last observations, as vectors, are shown as one", at_least=1
+    )
+    action_mask: bool = _task(
+        False,
+        "learn and act by the environment's masks of valid actions: action_masks(), or "
+        "info['action_mask']",
+        needs_spaces=readers.CHOICES,
+    )
     arm: tuple[str, ...] = _run(
         ("ppo",), "what to train, a name or several: see `sauna list arms`", common=True
     )

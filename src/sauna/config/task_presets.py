@@ -2,7 +2,7 @@
 
 "RL Zoo" is DLR-RM/rl-baselines3-zoo, `hyperparams/ppo.yml` at revision 22e3ff2. A comment says what
 differs from its numbers; without one, nothing does. Two things always differ: RL Zoo's gSDE
-(exploration that depends on the state) is left out, and `value_coef` is twice its `vf_coef`, as the
+(`distribution=gsde`) is left out, and `value_coef` is twice its `vf_coef`, as the
 value loss here has a factor 0.5.
 """
 

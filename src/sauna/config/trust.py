@@ -24,7 +24,7 @@ from sauna.system.errors import BadInput, SaunaError
 from sauna.system.safe_read import read_file
 from sauna.system.safe_write import open_new, sync_folder
 
-FIELDS = (*fields_with("plugin"), "tasks", "measure", "track")  # that may name code
+FIELDS = (*fields_with("plugin"), "tasks", "measure", "track", "wrap")  # that may name code
 # Ids of Gymnasium whose arguments name an environment of another library.
 WRAPPERS = ("GymV21Environment", "GymV26Environment")
 KEY_BYTES = 32

@@ -16,8 +16,9 @@ from sauna.envs.host.answers import close
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.packages import as_vector, package_of, register
-from sauna.envs.host.together import is_known, maker_of, plain_maker, rows_of
+from sauna.envs.host.together import group_size, is_known, maker_of, plain_maker, rows_of
 from sauna.envs.spaces import stretch
+from sauna.envs.wrapping import PLAIN, Wrapping, wrapped
 from sauna.system.errors import BadInput, nearest, one_line
 
 _GYMNASIUM_ID = re.compile(r"^(?:[\w./-]+:)?(?:[\w-]+/)?[\w.-]+-v\d+$")
@@ -182,7 +183,7 @@ def tame_mujoco() -> None:
     mujoco.set_mju_user_warning(warn)
 
 
-def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
+def make_env(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN, **more: Any) -> Any:
     """One environment, or a `BadInput` that says why it cannot be made."""
     maker = env_maker(env, env_kwargs)
     try:
@@ -196,16 +197,31 @@ def make_env(env: str, env_kwargs: dict[str, Any], **more: Any) -> Any:
         )
     if not hasattr(made, "observation_space"):
         raise BadInput(f"env: {_shown(env)} gives no environment, but {type(made).__name__}")
-    return made
+    _check_stands_alone(env, made, wrapping)
+    return wrapped(made, wrapping)
 
 
-def make_drawn_env(env: str, env_kwargs: dict[str, Any]) -> Any:
+def _check_stands_alone(env: str, made: Any, wrapping: Wrapping) -> None:
+    """Refuses wrappers around rows that are stepped together.
+
+    Raises:
+      BadInput: naming the setting.
+    """
+    if wrapping == PLAIN or group_size(made) is None:
+        return
+    name = next(
+        name for name in Wrapping._fields if getattr(wrapping, name) != getattr(PLAIN, name)
+    )
+    raise BadInput(f"{name}: the rows of {_shown(env)} are stepped together; wrap what makes them")
+
+
+def make_drawn_env(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Any:
     """As `make_env`, with pictures (`rgb_array`) that follow the robot.
 
     Where no camera is asked for, Gymnasium 1.4 draws MuJoCo tasks from where they begin, and a
     robot that runs leaves the picture. Before, and here, the model's own camera `track` is used.
     """
-    made = make_env(env, env_kwargs, render_mode="rgb_array")
+    made = make_env(env, env_kwargs, wrapping, render_mode="rgb_array")
     renderer = getattr(getattr(made, "unwrapped", None), "mujoco_renderer", None)
     if renderer is not None and not any("camera" in name for name in env_kwargs):
         import mujoco
@@ -221,6 +237,7 @@ def in_process_envs(
     seeds: Sequence[tuple[int, int]],
     backend: str,
     rescale: bool = False,
+    wrapping: Wrapping = PLAIN,
 ) -> HostEnvs:
     """M environments stepped in this process, by the fastest backend that gives the same bits.
 
@@ -229,6 +246,7 @@ def in_process_envs(
       seeds: `(member seed, env index)` of each environment.
       backend: `auto`, or `gymnasium` to have every step taken by Gymnasium itself.
       rescale: stretch actions in [-1, 1] to a bounded box.
+      wrapping: is put around each environment, which Gymnasium itself then steps.
     """
     env = one_name(env)
     make = env_maker(env, env_kwargs)
@@ -240,7 +258,11 @@ def in_process_envs(
             close(first)
             return together
         made = [first]  # which was only to be looked at
-        return GymnasiumEnvs(lambda: made.pop() if made else make(), seeds, rescale)
+        return GymnasiumEnvs(
+            lambda: wrapped(made.pop() if made else make(), wrapping), seeds, rescale
+        )
+    if wrapping != PLAIN:
+        return GymnasiumEnvs(lambda: wrapped(make(), wrapping), seeds, rescale)
     if backend == "auto" and env.startswith("ALE/"):
         from sauna.envs.host.atari_envs import AtariEnvs
 

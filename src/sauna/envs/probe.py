@@ -10,8 +10,9 @@ from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_num
 from sauna.envs.host.parallel_envs import AgentsAsOne
 from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
-from sauna.envs.shapes import check_shapes
+from sauna.envs.shapes import check_shapes, mask_in
 from sauna.envs.spaces import Spaces, describe, observation_reader
+from sauna.envs.wrapping import PLAIN, Wrapping, wrapped_space
 from sauna.system.errors import BadInput, one_line
 
 STEPS = 25
@@ -33,7 +34,7 @@ class Probe(NamedTuple):
     group: int | None = None
 
 
-def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
+def probe(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Probe:
     """Makes the environment twice and plays the same seed and actions in both.
 
     One of the two has played another episode before, so that a state which survives a reset is
@@ -42,7 +43,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     Raises:
       BadInput: the environment cannot be made or played, or its spaces are not supported.
     """
-    first, second = make_env(env, env_kwargs), make_env(env, env_kwargs)
+    first, second = (make_env(env, env_kwargs, wrapping) for _ in range(2))
     try:
         spaces = describe(first.observation_space, first.action_space)
         limit = getattr(getattr(first, "spec", None), "max_episode_steps", None)
@@ -61,7 +62,7 @@ def probe(env: str, env_kwargs: dict[str, Any]) -> Probe:
     return Probe(spaces, differs, limit if isinstance(limit, int) else None, group)
 
 
-def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
+def probe_on_device(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Probe:
     """The spaces of an environment on the device, which repeats itself by construction.
 
     Raises:
@@ -71,13 +72,15 @@ def probe_on_device(env: str, env_kwargs: dict[str, Any]) -> Probe:
     from sauna.envs.device.make import make_jax_env
 
     made = make_jax_env(env, env_kwargs)
-    spaces = describe(made.observation_space, made.action_space)
+    spaces = describe(wrapped_space(made, wrapping), made.action_space)
+    if spaces.mask and made.action_mask is None:
+        raise BadInput("action_mask: the environment gives none (JaxEnv.action_mask)")
     if ":" in env:
-        _check_traced(env, made, spaces)
+        _check_traced(env, made, spaces, wrapping)
     return Probe(spaces, None)
 
 
-def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
+def _check_traced(env: str, made: Any, spaces: Spaces, wrapping: Wrapping) -> None:
     """Traces a reset and a step, which compiles and computes nothing.
 
     Raises:
@@ -86,8 +89,10 @@ def _check_traced(env: str, made: Any, spaces: Spaces) -> None:
     import jax
 
     from sauna.envs.device.contract import flat
+    from sauna.envs.device.stacked import stacked
 
-    one = flat(_with_checked_shapes(made))
+    made = stacked(_with_checked_shapes(made), wrapping.stack)
+    one = flat(made, masked=wrapping.action_mask)
     action = jax.ShapeDtypeStruct((spaces.action_width,), spaces.action_dtype)
     try:
         state, first = jax.eval_shape(lambda: one.reset(jax.random.key(0)))
@@ -150,16 +155,26 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
         return found
 
     env.action_space.seed(seed)
-    seen = [(read(first_of(env.reset(seed=seed))), 0.0, False)]
+    observation = first_of(env.reset(seed=seed))
+    seen = [(read(observation), 0.0, False)]
     for _ in range(STEPS):
         observation, reward, terminated, truncated, info = five_of(
-            env.step(env.sample() if agents else env.action_space.sample())
+            env.step(env.sample() if agents else _any_action(env, observation))
         )
         life_lost(info)  # raises where it cannot be read
         seen.append((read(observation), one_number(reward), bool(terminated or truncated)))
         if seen[-1][2]:
             break
     return seen
+
+
+def _any_action(env: Any, observation: Any) -> Any:
+    """Draws an action, a valid one if the observation holds a mask."""
+    if not mask_in(env.observation_space)[0]:
+        return env.action_space.sample()
+    from sauna.envs.masked import sample_valid
+
+    return sample_valid(env.action_space, observation["action_mask"])
 
 
 def _difference(

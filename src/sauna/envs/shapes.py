@@ -11,11 +11,11 @@ import numpy as np
 
 def shape_check(space: Any) -> Callable[[Any], None]:
     """Makes `check_shapes` of a space, fast if every part is an array of its shape, or a number."""
-    leaves = [(path, tuple(part.shape or ())) for path, part in parts_of(space)]
+    parts = [(path, tuple(part.shape or ())) for path, part in leaves(space)]
 
     def check(observation: Any) -> None:
         try:
-            for path, shape in leaves:
+            for path, shape in parts:
                 part = observation
                 for name in path:
                     part = part[name]
@@ -33,16 +33,29 @@ def shape_check(space: Any) -> Callable[[Any], None]:
     return check
 
 
-def parts_of(space: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """`(path, space)` of each part that is no Dict or Tuple, in the order of flattening."""
+def leaves(space: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """`(path, space)` of each part that is no Dict or Tuple."""
     from gymnasium import spaces as gym
 
     if isinstance(space, gym.Dict | gym.Tuple):
         parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
         for name, part in parts:
-            yield from parts_of(part, (*path, name))
+            yield from leaves(part, (*path, name))
     else:
         yield path, space
+
+
+def mask_in(space: Any) -> tuple[int, Any]:
+    """Entries of the action mask that observations hold (0: none), and the space of the rest."""
+    mask = getattr(space, "mask_size", 0)
+    return mask, space["observation"] if mask else space
+
+
+def part_at(observation: Any, path: tuple[Any, ...]) -> Any:
+    """The part that `leaves` gives a path for."""
+    for name in path:
+        observation = observation[name]
+    return observation
 
 
 def check_shapes(space: Any, observation: Any) -> None:

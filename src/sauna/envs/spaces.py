@@ -8,16 +8,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.shapes import parts_of, shape_check
+from sauna.envs.pictures import (
+    channels_last,
+    highest_byte,
+    is_bytes,
+    is_float_picture,
+    is_large,
+    is_picture,
+    picture_reader,
+)
+from sauna.envs.shapes import leaves, mask_in, part_at, shape_check
 from sauna.system.errors import BadInput
 
-SMALLEST_IMAGE = 36  # the Nature CNN's three convolutions need this many pixels
 PICTURES = ("image", "float_image")  # kinds of observations that are one picture
 MAX_BOUND = 1e30  # an action box this wide is not bounded: such bounds stand for none
 
 
+Picture = tuple[int, int, int, float]  # height, width, channels, the highest byte
+
+
 class Spaces(NamedTuple):
-    """What the learner has to know of an environment's spaces."""
+    """What the learner has to know of an environment's spaces.
+
+    An observation is one array: a picture `[H, W, C]` of bytes, or numbers `[D]`. Those are, in
+    this order, `numbers`, the mask of the valid actions (`mask` of them, 1 or 0), and the
+    `pictures`, each as `H * W * C` numbers. Mostly they are `numbers` alone.
+    """
 
     observation_kind: str  # vector | image (bytes) | float_image (in [0, 1]) | one_hot
     observation_shape: tuple[int, ...]
@@ -27,10 +43,37 @@ class Spaces(NamedTuple):
     observation_structure: Any
     action_structure: Any
     observation_high: float = 255.0  # of an image's bytes: the networks here divide by it
+    action_bounded: bool = True  # whether each component of a continuous action has both bounds
+    mask: int = 0  # 0: no mask, every action is valid
+    pictures: tuple[Picture, ...] = ()
 
     @property
     def observation_dtype(self) -> Any:
         return np.uint8 if self.observation_kind == "image" else np.float32
+
+    @property
+    def numbers(self) -> int:
+        """The observation's first numbers: what is neither mask nor picture."""
+        if self.observation_kind in PICTURES:
+            return 0
+        return self.observation_shape[0] - self.mask - sum(map(picture_size, self.pictures))
+
+    @property
+    def normalized(self) -> int:
+        """The observation's first numbers that have running moments."""
+        return self.numbers if self.observation_kind == "vector" else 0
+
+    @property
+    def picture_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Of all pictures: the observation itself, or those in it."""
+        if self.observation_kind in PICTURES:
+            return (self.observation_shape,)
+        return tuple(picture[:3] for picture in self.pictures)
+
+    @property
+    def is_combined(self) -> bool:
+        """Whether pictures stand beside numbers or other pictures."""
+        return bool(self.numbers and self.pictures) or len(self.pictures) > 1
 
     @property
     def action_dtype(self) -> Any:
@@ -41,6 +84,31 @@ class Spaces(NamedTuple):
         """Components of one action (`A`)."""
         one_each = len(self.action_sizes)
         return one_each if self.action_kind.endswith("discrete") else self.action_sizes[0]
+
+
+def picture_size(picture: Picture) -> int:
+    """Counts the bytes of a picture."""
+    return picture[0] * picture[1] * picture[2]
+
+
+def picture_alone(spaces: Spaces, picture: Picture) -> Spaces:
+    """The spaces of an environment that shows one of the pictures and nothing else."""
+    return spaces._replace(
+        observation_kind="image",
+        observation_shape=picture[:3],
+        observation_high=picture[3],
+        mask=0,
+        pictures=(),
+    )
+
+
+def seen_spaces(spaces: Spaces) -> Spaces:
+    """The spaces as the network sees them: without the mask, and a picture by itself as one."""
+    if len(spaces.pictures) == 1 and not spaces.numbers:
+        return picture_alone(spaces, spaces.pictures[0])
+    if not spaces.mask:
+        return spaces
+    return spaces._replace(observation_shape=(spaces.observation_shape[0] - spaces.mask,), mask=0)
 
 
 def read_spaces(values: list[Any]) -> Spaces:
@@ -55,7 +123,22 @@ def read_spaces(values: list[Any]) -> Spaces:
             type(n) is int and 0 <= n < 2**31 for n in sizes
         ):
             raise ValueError(f"{sizes} are no sizes")
+    _check_parts(spaces)
     return spaces
+
+
+def _check_parts(spaces: Spaces) -> None:
+    """Refuses parts that an observation has no place for.
+
+    Raises:
+      TypeError, ValueError: they are none.
+    """
+    for picture in spaces.pictures:
+        height, width, channels, high = picture
+        if not all(type(n) is int and n > 0 for n in (height, width, channels)) or not high > 0:
+            raise ValueError(f"{picture} is no picture")
+    if type(spaces.mask) is not int or spaces.mask < 0 or spaces.numbers < 0:
+        raise ValueError("its observations have no place for their parts")
 
 
 def _tuples(value: Any) -> Any:
@@ -69,6 +152,8 @@ def difference(before: Spaces, now: Spaces) -> str:
     """
     for name in Spaces._fields:
         old, new = getattr(before, name), getattr(now, name)
+        if name == "action_bounded":
+            continue
         if name.endswith("structure") and not (isinstance(old, tuple) and isinstance(new, tuple)):
             continue  # text, of 0.1.0
         if old != new:
@@ -108,11 +193,35 @@ def describe(observation_space: Any, action_space: Any) -> Spaces:
     Raises:
       BadInput: a space that is not supported, by name.
     """
-    kind, shape = describe_observation(observation_space)
-    high = float(observation_space.high.max(initial=0)) if kind == "image" else 0.0
+    mask, inner = mask_in(observation_space)
+    kind, shape = describe_observation(inner)
+    if mask and kind == "float_image":
+        raise BadInput("action_mask: a picture beside a mask has to be of bytes (uint8)")
+    high = highest_byte(inner) if kind == "image" else 255.0
     action_kind, sizes = _describe_action(action_space)
-    parts = _structure(observation_space), _structure(action_space)
-    return Spaces(kind, shape, action_kind, sizes, *parts, high or 255.0)
+    parts = _structure(inner), _structure(action_space)
+    bounded = action_kind != "continuous" or bool(bounded_components(action_space).all())
+    spaces = Spaces(kind, shape, action_kind, sizes, *parts, high, bounded)
+    if kind != "image" or mask:
+        spaces = spaces._replace(pictures=tuple(map(_picture, _pictures_in(inner))))
+    if not mask:
+        return spaces
+    kind, size = ("vector" if kind == "image" else kind), math.prod(shape) + mask
+    return spaces._replace(
+        observation_kind=kind, observation_shape=(size,), observation_high=255.0, mask=mask
+    )
+
+
+def _pictures_in(space: Any) -> list[Any]:
+    """The spaces of the pictures of an observation that is more than one picture, in order."""
+    if is_bytes(space):
+        return [space]
+    return [part for _, part in leaves(space) if is_picture(part)]
+
+
+def _picture(space: Any) -> Picture:
+    height, width, channels = channels_last(space.shape)
+    return height, width, channels, highest_byte(space)
 
 
 def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
@@ -123,32 +232,15 @@ def describe_observation(space: Any) -> tuple[str, tuple[int, ...]]:
     """
     from gymnasium import spaces as gym
 
-    if _is_bytes(space):
-        return "image", _channels_last(space.shape)
-    if _is_float_picture(space):
-        return "float_image", _channels_last(space.shape)
+    if is_bytes(space):
+        return "image", channels_last(space.shape)
+    if is_float_picture(space):
+        return "float_image", channels_last(space.shape)
     _check_part(space, "")
     size = int(gym.utils.flatdim(space))
     if isinstance(space, gym.Discrete | gym.MultiDiscrete | gym.MultiBinary):
         return "one_hot", (size,)
     return "vector", (size,)
-
-
-def _is_bytes(space: Any) -> bool:
-    """Whether a space is a picture or a board: `uint8`, of two or three axes."""
-    from gymnasium import spaces as gym
-
-    return isinstance(space, gym.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3)
-
-
-def _is_float_picture(space: Any) -> bool:
-    """Whether a space is a picture of floats in [0, 1]; small boards are vectors."""
-    from gymnasium import spaces as gym
-
-    if not isinstance(space, gym.Box) or not np.issubdtype(space.dtype, np.floating):
-        return False
-    large = sum(side >= SMALLEST_IMAGE for side in space.shape) >= 2 and len(space.shape) <= 3
-    return large and bool((space.low == 0).all() and (space.high == 1).all())
 
 
 def _check_part(space: Any, key: str) -> None:
@@ -169,7 +261,7 @@ def _check_part(space: Any, key: str) -> None:
             f"observation space{key}: {type(space).__name__} is not supported (Box, Discrete, "
             "MultiDiscrete, MultiBinary, and Dict and Tuple of those are)"
         )
-    if sum(side >= SMALLEST_IMAGE for side in space.shape or ()) >= 2:
+    if is_large(space) and not (key and is_picture(space)):
         raise BadInput(
             f"observation space{key}: pictures of shape {space.shape} and type {space.dtype} are "
             f"not supported {_instead(space, key)}"
@@ -181,7 +273,7 @@ def _instead(space: Any, key: str) -> str:
     flat = "gymnasium.wrappers.FlattenObservation makes one vector of it for an MLP"
     if key:
         return (
-            "in a Dict or Tuple: give the picture alone (uint8 [H, W, C]), "
+            "in a Dict or Tuple: give it as uint8 [H, W, C], "
             "or leave it out (gymnasium.wrappers.FilterObservation)"
         )
     if len(space.shape) > 3:
@@ -209,17 +301,6 @@ def _describe_action(space: Any) -> tuple[str, tuple[int, ...]]:
     )
 
 
-def _channels_last(shape: tuple[int, ...]) -> tuple[int, ...]:
-    if len(shape) == 2:
-        return (*shape, 1)
-    return (shape[1], shape[2], shape[0]) if channels_first(shape) else shape
-
-
-def channels_first(shape: tuple[int, ...]) -> bool:
-    """A stack of frames `[C, H, W]`: fewer channels in front than pixels behind."""
-    return len(shape) == 3 and shape[0] < min(shape[1:])
-
-
 def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     """A function from the env's observation to the array of `Spaces.observation_shape`.
 
@@ -228,12 +309,10 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
     """
     from gymnasium import spaces as gym
 
-    if _is_bytes(space) or _is_float_picture(space):
-        if len(space.shape) == 2:
-            return lambda image: np.asarray(image)[..., None]
-        if channels_first(space.shape):
-            return lambda image: np.moveaxis(np.asarray(image), 0, -1)
-        return np.asarray
+    if mask_in(space)[0] or (not is_bytes(space) and _pictures_in(space)):
+        return _packed_reader(space)
+    if is_bytes(space) or is_float_picture(space):
+        return picture_reader(space)
     if isinstance(space, gym.Box) and len(space.shape) == 1:
         return np.asarray
 
@@ -254,10 +333,10 @@ def _flattener(space: Any, check: Callable[[Any], None]) -> Callable[[Any], np.n
     from gymnasium import spaces as gym
 
     places, end = [], 0
-    for path, part in parts_of(space):
+    for path, part in leaves(space):
         start, end = end, end + int(gym.utils.flatdim(part))
         places.append((path, _part_writer(part), start, end))
-    dtype = np.result_type(*(part.dtype for _, part in parts_of(space)))
+    dtype = np.result_type(*(part.dtype for _, part in leaves(space)))
 
     def flatten(observation: Any) -> np.ndarray:
         check(observation)
@@ -291,6 +370,30 @@ def _part_writer(space: Any) -> Callable[[np.ndarray, Any], None]:
     if isinstance(space, gym.Discrete):
         return one_hot
     return plain if isinstance(space, gym.Box | gym.MultiBinary) else any_other
+
+
+def _packed_reader(space: Any) -> Callable[[Any], np.ndarray]:
+    """Of an observation of several parts: numbers, mask and pictures side by side, as float64."""
+    from gymnasium import spaces as gym
+
+    mask, inner = mask_in(space)
+    check, parts = shape_check(space), list(leaves(inner))
+    as_picture = is_bytes if is_bytes(inner) else is_picture
+    numbers = [(path, part) for path, part in parts if not as_picture(part)]
+    pictures = [(path, picture_reader(part)) for path, part in parts if as_picture(part)]
+
+    def read(observation: Any) -> np.ndarray:
+        check(observation)
+        seen = observation["observation"] if mask else observation
+        found = [gym.flatten(part, part_at(seen, path)) for path, part in numbers]
+        if mask:
+            found.append(observation["action_mask"])
+        found += [
+            np.asarray(picture(part_at(seen, path))).reshape(-1) for path, picture in pictures
+        ]
+        return np.concatenate(found, dtype=np.float64)
+
+    return read
 
 
 def action_writer(space: Any, rescale: bool = False) -> Callable[[np.ndarray], Any]:
@@ -374,9 +477,15 @@ def stretch(space: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
       `(bounded, center, half)`, or None where nothing would change.
     """
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
-    bounded = (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)
+    bounded = bounded_components(space)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     center, half = (low + high) / 2, (high - low) / 2
     if np.all(center == 0.0) and np.all(half == 1.0):
         return None
     return bounded, center, half
+
+
+def bounded_components(space: Any) -> np.ndarray:
+    """Which components `[A]` of a box of actions have both bounds."""
+    low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+    return (low > -MAX_BOUND) & (high < MAX_BOUND) & (low < high)

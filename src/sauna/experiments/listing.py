@@ -14,6 +14,8 @@ from sauna.config.presets import (
 )
 from sauna.config.settings import NATIVE
 from sauna.config.zoo import ENVS, row_of
+from sauna.system.run_directory import read_config
+from sauna.training.located import zoo
 
 HELP = {"arms": ARM_HELP, "presets": PRESET_HELP, "filters": FILTER_HELP, "targets": TARGET_HELP}
 HEAD = ("environment", "preset", "env steps", "RL Zoo's return")
@@ -35,6 +37,8 @@ def listing(what: str) -> list[str]:
         from sauna.envs.device.make import names_of
 
         return names_of(what)
+    if what == "zoo":
+        return list(_policies())
     if what == "rules":
         return list(_rules())
     if what == "studies":
@@ -45,6 +49,17 @@ def listing(what: str) -> list[str]:
     width = max(map(len, HELP[what]))
     lines = [f"{name:{width}}  {text}" for name, text in HELP[what].items()]
     return lines + (["", "What `sauna train ENV` takes:", *_zoo()] if what == "presets" else [])
+
+
+def _policies() -> Iterator[str]:
+    """The trained policies that come with this package."""
+    row = "{:30} {:>18}  {:>11}".format
+    yield row("policy", "return", "env steps")
+    for name, folder in zoo().items():
+        stored = read_config(folder, exported=True)
+        played = stored["evaluation"]
+        found = f"{played['mean']:,.1f} +- {played['std']:,.1f}"
+        yield row(f"zoo:{name}", found, f"{stored['env_steps']:,}")
 
 
 def _envs() -> Iterator[str]:

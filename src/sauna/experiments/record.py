@@ -13,7 +13,9 @@ import numpy as np
 from sauna import __version__
 from sauna.config.imported_from import names_the_folder
 from sauna.envs.host.answers import close, one_number
+from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.episodes import kwargs_of, provided, statistics
 from sauna.experiments.evaluate.play import Progress
@@ -78,10 +80,14 @@ def record(
         raise BadInput(f"to: {to!r} is neither minari:NAME nor a file that ends in .parquet")
     to = to if to.startswith(MINARI) else str(Path.cwd() / to)
     artifact = load_artifact(run, say, checkpoint, trust=trust)
+    if artifact.config.action_mask:
+        raise BadInput("record: a data set has no place for action masks")
     env = provided(run, env, parts)
     name = find_member(artifact.members, 0 if member is None else member)
     kwargs, chosen = kwargs_of(artifact, env, env_kwargs), env or artifact.config.env
-    made = make_env(chosen, kwargs)
+    made = make_env(chosen, kwargs, wrapping_of(artifact.config))
+    if group_size(made):
+        raise BadInput("record: episodes of several agents at once cannot be recorded")
     check_spaces(artifact, made)
     about = {
         "env": chosen,

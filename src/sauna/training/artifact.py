@@ -16,6 +16,7 @@ from sauna.config.settings import Config
 from sauna.config.stored import read_stored
 from sauna.config.trust import check_trusted
 from sauna.envs.spaces import Spaces, describe, difference, read_spaces
+from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, nearest
 from sauna.system.logs import check_logs
@@ -217,6 +218,7 @@ def check_spaces(artifact: Artifact, env: Any) -> None:
     Raises:
       BadInput: naming the space that differs.
     """
-    found = describe(env.observation_space, env.action_space)
+    space = wrapped_space(env, wrapping_of(artifact.config))
+    found = describe(space, env.action_space)
     if differs := difference(artifact.spaces, found):
         raise BadInput(f"env: has other spaces than the run: {differs}")

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from sauna.algorithm.learner.optimizers import scaling
 from sauna.algorithm.learner.vex_targets import make_target
+from sauna.algorithm.policy.observation import seen_of
 from sauna.algorithm.policy.policy import Policy, check_collections, make_trunk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import make_program
@@ -53,7 +54,8 @@ def _check_network(config: Config, spaces: Spaces) -> None:
     try:
         for lead in ((2,), (3, 2)):
             shape = (*lead, *spaces.observation_shape)
-            seen = jax.ShapeDtypeStruct(shape, spaces.observation_dtype)
+            whole = jax.ShapeDtypeStruct(shape, spaces.observation_dtype)
+            seen = jax.eval_shape(partial(seen_of, spaces), whole)
             variables = jax.eval_shape(module.init, key, seen)
             check_collections(config, variables)
             given = jax.eval_shape(module.apply, variables, seen)
@@ -90,6 +92,7 @@ def _check_finite(field: str, module: Any, key: Any, spaces: Spaces) -> None:
         seen = jax.random.bernoulli(key, 0.5, shape).astype(jnp.float32)
     else:
         seen = jax.random.normal(key, shape)
+    seen = seen_of(spaces, seen)
     variables = module.init(key, seen)
 
     def total(variables: Any) -> Any:

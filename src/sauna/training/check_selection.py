@@ -96,7 +96,8 @@ def _trace(config: Config, spaces: Spaces, sampler: Sampler) -> tuple[Any, Any, 
     if sampler.reads_policy:
         policy = make_policy(config, spaces)
         params = jax.eval_shape(policy.init, jax.eval_shape(lambda: jax.random.key(0)))
-        output = jax.eval_shape(policy.apply, params, seen)
+        state = jax.eval_shape(lambda: policy.initial_state(rows))
+        output = jax.eval_shape(policy.step, params, seen, state)[0]
         samples = samples._replace(
             log_ratio=number, policy=output.policy, hidden=output.hidden, entropy=number
         )

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sauna.config.choices import BOUNDED
 from sauna.config.presets import Member
 from sauna.config.readers import DATA
 from sauna.config.settings import Config
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
 from sauna.training.data.episodes import MINARI, Demonstrations, demonstrations
@@ -95,17 +97,25 @@ def clone_members(
 
 def _read(prepared: Prepared) -> Demonstrations:
     config, spaces = prepared.config, prepared.spaces
+    if spaces.mask or spaces.pictures:
+        what = "action masks" if spaces.mask else "pictures beside other observations"
+        raise BadInput(f"init_from: cloning from data does not know {what}")
     name, text = config.init_from, config.init_from.removeprefix(DATA)
     if text.startswith(MINARI):
         episodes = read_minari(text, name, spaces, config.env)
     else:
         episodes = read_parquet(Path(text), name, spaces, config.env)
-    made = make_env(config.env, json.loads(config.env_kwargs))
+    made = make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config))
     try:
         rescale = config.rescale_actions
-        return demonstrations(episodes, spaces, made.action_space, rescale, name)
+        data = demonstrations(episodes, spaces, made.action_space, rescale, name)
     finally:
         close(made)
+    if spaces.action_kind == "continuous" and config.distribution in BOUNDED:
+        from sauna.algorithm.policy.bounded import from_env
+
+        return data._replace(action=from_env(data.action))
+    return data
 
 
 def _moments(data: Demonstrations, config: Config) -> Moments | None:

@@ -54,6 +54,7 @@ class Coordinator:
       tracked: for each member the env steps up to which its rows were tracked before.
       callback: see `Callback`.
       draw: draws a figure of the run at its end; None if there is nothing to draw.
+      until: the iteration at whose start the run pauses; None: it goes on to its end.
     """
 
     def __init__(
@@ -66,9 +67,10 @@ class Coordinator:
         tracked: Mapping[str, int],
         callback: Callback | None,
         draw: Callable[[Path], Path | None] | None,
+        until: int | None = None,
     ) -> None:
         self._run, self._display = run, display
-        self._callback, self._draw = callback, draw
+        self._callback, self._draw, self._until = callback, draw, until
         self._stopped: dict[str, int] = {}  # by the callback: member, the iteration after its last
         self._iteration = loaded.manifest["iteration"] if loaded else 0
         self._parts = np.array_split(np.arange(len(run.members)), run.config.processes)
@@ -149,15 +151,15 @@ class Coordinator:
             self._trackers.open()  # while the workers compile
             while any(end is None for end in self._ended):
                 self._pump()
-            complete = self._signal is None
+            complete = self._signal is None and self._until is None
             arrays = self._save(self._last_iteration(), self._logs.counted())
             self._write_summary(complete, arrays)
         if self._draw is not None and (figure := self._draw(run.path)) is not None:
             self._trackers.picture(figure.stem, figure)
-        if not complete:
+        if self._signal is not None:
             raise Interrupted(
-                self._signal or 0,
-                f"stopped by {signal.Signals(self._signal or 0).name} after iteration "
+                self._signal,
+                f"stopped by {signal.Signals(self._signal).name} after iteration "
                 f"{self._last_iteration()}; continue with: {resume_command(self._run.path)}",
             )
 
@@ -186,7 +188,9 @@ class Coordinator:
             return
         # With a callback, an iteration begins when it has seen all rows before.
         granted = self._iteration + 1 if self._callback else min(running) + self._lead
-        if granted > self._granted:
+        if self._until is not None and granted >= self._until:
+            granted, self._stopping = self._until, True
+        if granted > self._granted or self._stopping:
             self._granted = granted
             self._send_grant()
 

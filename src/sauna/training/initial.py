@@ -31,6 +31,10 @@ SHAPES = (
     "layer_norm",
     "value_hidden",
     "trunk",
+    "recurrent",
+    "recurrent_width",
+    "distribution",
+    "sde_expln",
     "rescale_actions",
     "normalize_observations",
 )

@@ -9,13 +9,13 @@ from sauna.config.other_names import ACCEPTED
 from sauna.config.presets import arm_settings, parse_all, resolve_run
 from sauna.config.settings import FIELDS, Config
 from sauna.config.zoo import AUTO, entry_of, preset_of_spaces
+from sauna.envs.pictures import SMALLEST_IMAGE
 from sauna.envs.probe import Probe
-from sauna.envs.spaces import PICTURES, SMALLEST_IMAGE
 from sauna.system.working_folder import kept_folder
 from sauna.training.prepare import look_at, place
 
 # What has to be known to look at an environment.
-LOOKED_AT = ("env", "env_kwargs", "backend", "device", "devices")
+LOOKED_AT = ("env", "env_kwargs", "wrap", "stack", "action_mask", "backend", "device", "devices")
 
 
 class Picked(NamedTuple):
@@ -53,8 +53,8 @@ def pick(overrides: Mapping[str, Any]) -> Picked:
         return Picked({**given, "preset": Config.preset})
     found = _look(given)
     spaces = found.spaces
-    large = min(spaces.observation_shape[:2], default=0) >= SMALLEST_IMAGE
-    pictures = spaces.observation_kind in PICTURES and large
+    shapes = spaces.picture_shapes
+    pictures = bool(shapes) and min(min(shape[:2]) for shape in shapes) >= SMALLEST_IMAGE
     discrete = spaces.action_kind != "continuous"
     preset, why = preset_of_spaces(pictures, discrete, found.time_limit)
     said = f"preset {preset}: the zoo does not know this environment, and {why}"

@@ -11,11 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sauna.config.checks import check_read, check_read_here, local_parts, own_parts
+from sauna.config.choices import BOUNDED
 from sauna.config.presets import Member, RunConfig, parse_all, resolve_run
 from sauna.config.settings import Config
 from sauna.envs.make import is_native
+from sauna.envs.pictures import SMALLEST_IMAGE
 from sauna.envs.probe import Probe, probe, probe_on_device
-from sauna.envs.spaces import PICTURES, SMALLEST_IMAGE, Spaces, board_of
+from sauna.envs.spaces import Spaces, board_of, seen_spaces
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.errors import BadInput
 from sauna.system.jax_setup import configure_jax
 from sauna.training.loop.multihost import check_split, read_host_rank
@@ -135,7 +138,10 @@ def examine(run: RunConfig, overrides: Mapping[str, Any], found: Probe | None = 
     _check_together(run, found.group)
     parsed = parse_all(overrides)
     check_read_here(run.config, found.spaces, parsed)
-    check_read(list(run.arms.values()), parsed)
+    reading = run
+    if found.spaces.is_combined:  # an MLP stands behind the pictures' networks
+        reading = run.replace(network="mlp")
+    check_read(list(reading.arms.values()), parsed)
     asked = parsed.get("processes", 0)
     if _together(run.config) and asked > 1:
         raise BadInput(f"processes: {asked} asked for, but all members and devices are one program")
@@ -146,12 +152,12 @@ def look_at(config: Config) -> Probe:
     """Learns what has to be known of the environment before a run starts."""
     kwargs = json.loads(config.env_kwargs)
     if config.backend != "device":
-        return probe(config.env, kwargs)
+        return probe(config.env, kwargs, wrapping_of(config))
     if local_parts(config):  # trained in this process
         configure_jax(config.devices if config.device == "cpu" else 0, config.device)
     else:
         configure_jax()
-    return probe_on_device(config.env, kwargs)
+    return probe_on_device(config.env, kwargs, wrapping_of(config))
 
 
 def check_writes(config: Config) -> None:
@@ -218,11 +224,15 @@ def _check_together(run: RunConfig, group: int | None) -> None:
 def _network(config: Config, spaces: Spaces) -> str:
     """Picks the network that `auto` stands for.
 
+    Args:
+      spaces: as the network sees them.
+
     Raises:
       BadInput: the one that is named does not fit the observations.
     """
-    picture = spaces.observation_kind in PICTURES
-    large = picture and min(spaces.observation_shape[:2]) >= SMALLEST_IMAGE
+    shapes = spaces.picture_shapes
+    picture = bool(shapes)
+    large = picture and min(min(shape[:2]) for shape in shapes) >= SMALLEST_IMAGE
     if config.network == "auto":
         return "nature-cnn" if large else "small-cnn" if picture else "mlp"
     fits = large if config.network == "nature-cnn" else picture or bool(board_of(spaces))
@@ -239,15 +249,20 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
     """Replaces what depends on the environment or the machine by what it comes to.
 
     Raises:
-      BadInput: the network does not fit the observations.
+      BadInput: the network does not fit the observations, or the distribution the actions.
     """
     config = run.config
-    network = _network(config, spaces)
+    network = _network(config, seen_spaces(spaces))
     predicted = math.prod(spaces.observation_shape)
     if config.auxiliary != "none" and predicted > MAX_PREDICTED:
         raise BadInput(
             f"auxiliary: an observation has {predicted:,} numbers; a head predicts at most "
             f"{MAX_PREDICTED:,}"
+        )
+    if config.distribution in BOUNDED and not spaces.action_bounded:
+        raise BadInput(
+            f"distribution: {config.distribution} needs bounds of every action; {config.env} has "
+            "components without (gaussian and gsde do not need them)"
         )
     number = len(run.members)
     processes = config.processes or os.cpu_count() or 1
@@ -257,7 +272,6 @@ def _settle(run: RunConfig, spaces: Spaces) -> RunConfig:
         processes = 1
     return run.replace(
         network=network,
-        normalize_observations=config.normalize_observations
-        and spaces.observation_kind == "vector",
+        normalize_observations=config.normalize_observations and spaces.normalized > 0,
         processes=min(processes, number),
     )

@@ -119,6 +119,22 @@ def start(
         check_trackers(prepared.config)
         check_own_parts(prepared)
         initial = read_initial(prepared, display.say, trust)
+    return create(prepared, display, initial)
+
+
+def create(
+    prepared: Prepared, display: Display, initial: tuple[Any, dict[str, Any]] | None = None
+) -> Run:
+    """Makes the directory of a run that is checked, and writes its `config.json`.
+
+    Args:
+      prepared: the run; its `out` names the directory.
+      display: what is said goes there.
+      initial: what it starts from, of `read_initial`.
+
+    Raises:
+      BadInput: the directory holds something already, or cannot be made.
+    """
     path, made = _make_directory(prepared.config)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
     path = Path.cwd() / path

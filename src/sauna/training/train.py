@@ -31,12 +31,14 @@ def train_run(
     inexact: bool = False,
     callback: Callback | None = None,
     draw: Callable[[Path], Path | None] | None = None,
+    until: int | None = None,
 ) -> bool:
     """Trains a run to its end; returns when everything is written.
 
     Args:
       callback: sees each row of `metrics.jsonl`; its member stops if it returns True.
       draw: draws a figure of the run at its end, for its trackers, too.
+      until: the iteration at whose start the run pauses, with its state saved; None: at its end.
 
     Returns:
       False if it was complete already, so that nothing was done.
@@ -52,7 +54,7 @@ def train_run(
         if callback is not None and run.config.distributed:
             raise BadInput("callback: not called with distributed")
         with disk_errors(run.path):
-            return _train(run, display, resume, inexact, callback, draw)
+            return _train(run, display, resume, inexact, callback, draw, until)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
             run_directory.discard(run.path, run.made)
@@ -68,6 +70,7 @@ def _train(
     inexact: bool,
     callback: Callback | None,
     draw: Callable[[Path], Path | None] | None,
+    until: int | None,
 ) -> bool:
     loaded, tracked = None, {}
     if resume:
@@ -78,7 +81,7 @@ def _train(
         tracked = last_steps(run_directory.rows(run.path)) if chosen(run.config) else {}
         cut_logs(run.path, loaded.manifest["logs"] if loaded else {})
     initial = load_initial(run.path, run.config) if loaded is None else {}
-    more = inexact, tracked, callback, draw
+    more = inexact, tracked, callback, draw, until
     with Coordinator(run, display, loaded, initial, *more) as coordinator:
         coordinator.run()
     return True

@@ -324,7 +324,7 @@ def test_recomputed_advantages_are_numpys_with_todays_values(truncation: str) ->
     following = np.where(outside, rollout.next_value, np.roll(now, -1, 0))
     cut = ended if truncation == "terminate" else rollout.terminated
     advantage, return_ = oracle_loss.gae(rollout.reward, now, following, cut, ended, 0.9, 0.8)
-    config: Config = dataclasses.replace(CONFIG, truncation=truncation)
+    config: Config = dataclasses.replace(CONFIG, truncation=truncation, recompute_advantages=True)
     single, h = floats(rollout._replace(keep=np.ones((STEPS, ENVS), bool))), floats(hypers())
     batch = make_batch(single, h, no_key(), config=config, target=TARGETS["sample"])
     got = recomputed(batch, single, jnp.asarray(now, jnp.float32), h, config=config)
@@ -412,3 +412,20 @@ def test_draws_share_no_key_with_the_orders_of_the_epochs() -> None:
         orders = jax.random.split(jax.random.fold_in(keys.order, iteration), 64)
         own = np.asarray(jax.random.key_data(selection_key(keys, iteration)))
         assert not (np.asarray(jax.random.key_data(orders)) == own).all(-1).any()
+
+
+def test_recomputed_advantages_are_of_the_steps_that_a_control_keeps() -> None:
+    """With the values of collection nothing changes, whichever steps were kept."""
+    config = configured(
+        arm="sauna+random", recompute_advantages=True, rollout_steps=STEPS, envs=ENVS, minibatches=1
+    )
+    rollout, h = floats(random_rollout(6, STEPS, ENVS, 0.5)), floats(hypers())
+    batch = make_batch(rollout, h, jax.random.key(0), config=config, target=TARGETS["sample"])
+    kept = jnp.zeros(STEPS * ENVS, bool).at[batch.row].set(batch.weight > 0)
+    assert bool(jnp.any(kept != rollout.keep.ravel()))
+    ended = rollout.terminated | rollout.truncated
+    following = jnp.concatenate([rollout.value[1:], rollout.next_value[-1:]])
+    rollout = rollout._replace(next_value=jnp.where(ended, rollout.next_value, following))
+    batch = make_batch(rollout, h, jax.random.key(0), config=config, target=TARGETS["sample"])
+    again = recomputed(batch, rollout, rollout.value, h, config=config)
+    np.testing.assert_allclose(again.advantage, batch.advantage, rtol=1e-4, atol=1e-5)

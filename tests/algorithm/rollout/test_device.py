@@ -73,11 +73,20 @@ def test_the_means_of_a_row_are_over_all_episodes_also_where_only_the_latest_are
 
 
 slow = pytest.mark.slow
+REMEMBERING = {"recurrent_width": 5, "sequence_length": 8, "trunk": "shared"}
 ARMS = [
     pytest.param("ppo", {}, marks=slow),
     ("sauna", {"threshold": 0.9}),
     ("sauna", {"threshold": 0.9, "dropped": "mask", "sign_rewards": True}),
     pytest.param("sauna", {"keep_rate_target": 0.6}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "recurrent": "gru", **REMEMBERING}, marks=slow),
+    pytest.param("ppo", {"recurrent": "lstm", **REMEMBERING}, marks=slow),
+    pytest.param(
+        "sauna", {"threshold": 0.9, "distribution": "gsde", "sde_sample_freq": 5}, marks=slow
+    ),
+    pytest.param("ppo", {"distribution": "gsde", "sde_expln": True}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "distribution": "squashed"}, marks=slow),
+    pytest.param("sauna", {"threshold": 0.9, "distribution": "beta"}, marks=slow),
     pytest.param("sauna", {"threshold": 0.9, "decision": "joint", "history": "kept"}, marks=slow),
     pytest.param(
         "sauna", {"threshold": 0.9, "reset": "cached", "normalize_rewards": False}, marks=slow
@@ -116,7 +125,8 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
         expected = collected.rollout
         rows = expected.valid.any(1)
         np.testing.assert_array_equal(np.asarray(rollout.valid), expected.valid)
-        for name in rollout._fields:
+        assert_same_memory(rollout, expected)
+        for name in set(rollout._fields) - {"memory"}:
             got, wanted = np.asarray(getattr(rollout, name)), getattr(expected, name)
             if got.dtype == bool:
                 np.testing.assert_array_equal(got, wanted, err_msg=name)
@@ -139,6 +149,19 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
             np.testing.assert_allclose(ends.return_[i], episode.return_, rtol=1e-4, atol=1e-5)
     dropped = 1.0 - collected.kept_steps / collected.env_steps
     assert (dropped > 0.05) == (arm != "ppo"), "the filter had something to do"
+
+
+def assert_same_memory(rollout: Any, expected: Any) -> None:
+    """Where episodes start, and the states before each chunk of the environments that act in it."""
+    if expected.memory is None:
+        assert rollout.memory is None
+        return
+    (start, state), (wanted, stored) = rollout.memory, expected.memory
+    valid = expected.valid
+    np.testing.assert_array_equal(np.asarray(start)[valid], wanted[valid])
+    begun = valid[:: len(valid) // len(stored)]
+    np.testing.assert_allclose(np.asarray(state)[begun], stored[begun], rtol=2e-4, atol=2e-5)
+    assert wanted.any() and np.abs(stored[begun]).max() > 0.01
 
 
 def same(value: Any) -> Any:

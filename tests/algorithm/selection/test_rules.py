@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from algorithm.selection import oracle
+from sauna.algorithm.policy.bounded import beta, squashed
 from sauna.algorithm.policy.distributions import bernoulli, gaussian, multi_categorical
 from sauna.algorithm.selection.gigaflow import gigaflow
 from sauna.algorithm.selection.gradient_norm import gradient_norm, head_gradient
@@ -235,6 +236,8 @@ def test_no_other_set_of_segments_varies_more(seed: int) -> None:
     "kind, sizes, distribution",
     [
         ("continuous", (2,), gaussian(2)),
+        ("squashed", (2,), squashed(2)),
+        ("beta", (2,), beta(2)),
         ("discrete", (3,), multi_categorical((3,))),
         ("multi_discrete", (3, 2), multi_categorical((3, 2))),
         ("multi_binary", (3,), bernoulli(3)),
@@ -244,18 +247,23 @@ def test_the_bound_is_the_gradients_norm_at_the_head(kind, sizes, distribution) 
     """By automatic differentiation of one row's log-probability over W, b and the log-std."""
     rng = np.random.default_rng(2)
     rows, width, hidden = 6, distribution.num_outputs, 4
+    name = kind if kind in ("squashed", "beta") else "gaussian"
+    kind = "continuous" if distribution.continuous else kind
     w, b, log_std = (rng.normal(size=s) for s in ((hidden, width), width, width))
     h = rng.normal(size=(rows, hidden))
 
     def parameters(w: Any, b: Any, log_std: Any, h: Any) -> Any:
         head = h @ w + b
-        return jnp.concatenate([head, log_std]) if kind == "continuous" else head
+        return jnp.concatenate([head, log_std]) if distribution.has_log_std else head
 
     policy = jnp.stack([parameters(w, b, log_std, x) for x in h])
     noise = distribution.draw(jax.random.key(0), (rows,))
     action = distribution.sample(policy, noise)
     got = head_gradient(
-        SETUP._replace(action_kind=kind, action_sizes=sizes), policy, action, jnp.asarray(h)
+        SETUP._replace(action_kind=kind, action_sizes=sizes, distribution=name),
+        policy,
+        action,
+        jnp.asarray(h),
     )
 
     def log_prob(w: Any, b: Any, log_std: Any, h: Any, action: Any) -> Any:

@@ -72,7 +72,7 @@ def asked(arm: str, envs: int = ENVS, **settings: Any) -> Asked:
 
 
 def rollouts(made: Asked) -> list[Rollout]:
-    return [Rollout(*(x[i : i + STEPS] for x in made.streams)) for i in (0, STEPS)]
+    return [jax.tree.map(lambda x: x[i : i + STEPS], made.streams) for i in (0, STEPS)]  # noqa: B023
 
 
 def advantages(rollout: Rollout) -> tuple[np.ndarray, np.ndarray]:

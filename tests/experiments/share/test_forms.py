@@ -36,6 +36,7 @@ MANY = 1000  # observations
 INF = np.inf
 BOX = gym.Box(-INF, INF, (5,))
 BOUNDED = gym.Box(np.array([-2, -INF, 0], np.float32), np.array([3, INF, 0.5], np.float32))
+FINITE = gym.Box(np.array([-2, 1], np.float32), np.array([3, 1.5], np.float32))
 NESTED = gym.Dict(
     {
         "b": gym.Box(-1, 1, (2, 2), np.float64),
@@ -53,6 +54,8 @@ KINDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
         gym.Box(-0.3, 0.3, (1, 2), np.float64),
         {"normalize": True, "trunk": "shared"},
     ),
+    "squashed": (BOX, FINITE, {"distribution": "squashed", "rescale_actions": True}),
+    "beta": (BOX, FINITE, {"distribution": "beta", "rescale_actions": True}),
     "one choice": (gym.Discrete(4), gym.Discrete(3, start=2), {"hidden": (8,)}),
     "nested, choices": (NESTED, gym.MultiDiscrete([2, 4]), {"normalize": True}),
     "bits": (gym.MultiDiscrete([3, 2]), gym.MultiBinary(3), {}),

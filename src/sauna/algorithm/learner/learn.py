@@ -18,6 +18,7 @@ from sauna.algorithm.learner.metrics import (
 from sauna.algorithm.learner.optimizers import moves_rate
 from sauna.algorithm.learner.replay import pool_rows, remember, with_replayed
 from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
+from sauna.algorithm.learner.sequences import in_sequences
 from sauna.algorithm.learner.update import Parts, loss_advantage, update_on_all, vex_targets
 from sauna.algorithm.selection.vex_filter import moved_threshold
 from sauna.algorithm.types import Array, Batch, Hypers, Rollout, TrainState
@@ -63,6 +64,8 @@ def learn(
         if config.normalize_over != "minibatch":
             over_all = loss_advantage(batch.advantage, batch.weight, config)
             learned_from = batch._replace(advantage=over_all)
+        if rollout.memory is not None:
+            learned_from = in_sequences(learned_from, rollout, config.sequence_length)
         state, losses, gradient_norm = update_on_all(
             state, learned_from, hypers, order, parts=parts
         )
@@ -81,7 +84,7 @@ def learn(
         *head_statistics(rollout.vex, rollout.valid),
         moved_threshold(rollout, hypers, config),
         state.learning_rate if moves_rate(config) else jnp.float32(jnp.nan),
-        policy_std(parts.policy.unravel(state.params)),
+        policy_std(parts.policy.unravel(state.params), config.sde_expln),
         is_finite & jnp.all(jnp.isfinite(state.params)),
         work,
     )

@@ -134,7 +134,7 @@ def loss_terms(
         advantage,
         jax.lax.stop_gradient(entropy),
         present,
-        distribution.has_log_std,
+        distribution.continuous,
     )
 
 

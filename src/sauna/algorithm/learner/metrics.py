@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from sauna.algorithm.learner.losses import weighted_mean
+from sauna.algorithm.policy.gsde import deviation
 from sauna.algorithm.types import Array, Params
 
 
@@ -54,10 +55,14 @@ def variance_explained(return_: Array, value: Array, weight: Array) -> Array:
     return 1.0 - variance(return_ - value) / variance(return_)
 
 
-def policy_std(params: Params) -> Array:
-    """The mean of the policy's standard deviations, which depend on no state; NaN without any."""
+def policy_std(params: Params, expln: bool) -> Array:
+    """The mean of the policy's standard deviations, which depend on no state; NaN without any.
+
+    Args:
+      expln: how they follow from their parameters; see `gsde.deviation`.
+    """
     log_std = params["params"].get("log_std")
-    return jnp.float32(jnp.nan) if log_std is None else jnp.mean(jnp.exp(log_std))
+    return jnp.float32(jnp.nan) if log_std is None else jnp.mean(deviation(log_std, expln))
 
 
 def head_statistics(vex: Array, valid: Array) -> tuple[Array, Array, Array]:

@@ -146,6 +146,8 @@ def flat_batch(
         batch = batch._replace(
             next_observation=take(following, rows), next_weight=take(there, rows) * weight
         )
+    if rollout.memory is not None or config.recompute_advantages:
+        batch = batch._replace(row=rows * rows.shape[1] + jnp.arange(rows.shape[1]))
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), batch)
 
 
@@ -208,6 +210,5 @@ def recomputed(
     if config.critic == "avec":
         now = with_unbiased_value(now, hypers, config)
     over_all = advantages_over_all(now, hypers, config.truncation == "bootstrap")
-    rows = kept_rows(rollout.keep, config.rollout_steps)
-    advantage = take(over_all, rows).ravel()
-    return batch._replace(advantage=advantage, return_=advantage + take(now.value, rows).ravel())
+    advantage = over_all.ravel()[batch.row]
+    return batch._replace(advantage=advantage, return_=advantage + now.value.ravel()[batch.row])

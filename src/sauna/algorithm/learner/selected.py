@@ -8,6 +8,8 @@ is spent on the steps that are run. Members that are compiled together run the m
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +18,11 @@ import jax.numpy as jnp
 from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
 from sauna.algorithm.learner.replay import pool_rows
 from sauna.algorithm.learner.samples import recomputed
+from sauna.algorithm.learner.sequence_choice import (
+    choice_of_sequences,
+    minibatches_of_sequences,
+)
+from sauna.algorithm.learner.sequences import rollout_outputs, row_outputs, units
 from sauna.algorithm.learner.update import (
     Parts,
     gradient_step,
@@ -59,7 +66,8 @@ class Totals(NamedTuple):
 def needs_selection(parts: Parts) -> bool:
     """Whether something of a run's rules takes more than PPO's plain loop."""
     config, rules = parts.config, parts.rules
-    masked = config.filter != "none" and config.dropped == "mask"
+    in_place = config.dropped == "mask" or config.recurrent != "none"
+    masked = config.filter != "none" and in_place
     chosen = bool(rules.sampler or rules.stop or parts.replay)
     return masked or chosen or config.recompute_advantages
 
@@ -85,7 +93,7 @@ def update_on_selected(
     sampler = parts.rules.sampler
     choice = None
     if sampler is None or not sampler.each_epoch:
-        state, choice = choose(state, batch, choice_key(key), parts=parts)
+        state, choice = choose(state, batch, rollout, choice_key(key), parts=parts)
 
     def not_last(carry: tuple[Array, TrainState, Totals]) -> Array:
         return (carry[0] < parts.config.epochs) & ~carry[2].stopped
@@ -94,12 +102,13 @@ def update_on_selected(
         e, state, totals = carry
         now, chosen = batch, choice
         if parts.config.recompute_advantages:
-            value = parts.policy.apply(state.params, rollout.observation).value
+            length = parts.config.sequence_length
+            value = rollout_outputs(parts.policy, state.params, rollout, length).value
             now = recomputed(batch, rollout, value, hypers, config=parts.config)
         if chosen is None:
-            state, chosen = choose(state, now, choice_key(key, e), parts=parts)
-        own = epoch_key(key, e)
-        state, totals = _epoch(state, totals, now, chosen, hypers, order[e], own, parts=parts)
+            state, chosen = choose(state, now, rollout, choice_key(key, e), parts=parts)
+        draws = order[e], epoch_key(key, e)
+        state, totals = _epoch(state, totals, now, chosen, rollout, hypers, draws, parts=parts)
         return e + 1, state, totals
 
     start = (jnp.int32(0), state, _no_totals())
@@ -122,18 +131,21 @@ def choice_key(key: Array, epoch: Any = None) -> Array:
 
 
 def first_draw(
-    state: TrainState, batch: Batch, order: Array, key: Array, *, parts: Parts
+    state: TrainState, batch: Batch, rollout: Rollout, order: Array, key: Array, *, parts: Parts
 ) -> tuple[TrainState, Choice, Draw]:
-    """What the first epoch of an update learns from; arguments as of `update_on_selected`."""
+    """What the first epoch of an update learns from; arguments as of `update_on_selected`.
+
+    Of a recurrent policy, the draw is one of sequences.
+    """
     sampler = parts.rules.sampler
     each_epoch = sampler is not None and sampler.each_epoch
     own = choice_key(key, 0) if each_epoch else choice_key(key)
-    state, choice = choose(state, batch, own, parts=parts)
-    return state, choice, _drawn(choice, batch, order[0], epoch_key(key, 0), parts)
+    state, choice = choose(state, batch, rollout, own, parts=parts)
+    return state, choice, _drawn(choice, batch, rollout, order[0], epoch_key(key, 0), parts)
 
 
 def choose(
-    state: TrainState, batch: Batch, key: Array, *, parts: Parts
+    state: TrainState, batch: Batch, rollout: Rollout, key: Array, *, parts: Parts
 ) -> tuple[TrainState, Choice]:
     """What the run's sampler takes; every row that is present if it has none."""
     sampler, present = parts.rules.sampler, batch.weight > 0
@@ -154,7 +166,8 @@ def choose(
         batch.vex,
     )
     if sampler.reads_policy:
-        output = parts.policy.apply(state.params, batch.observation)
+        length = parts.config.sequence_length
+        output = row_outputs(parts.policy, state.params, batch, rollout, length)
         distribution = parts.policy.distribution
         samples = samples._replace(
             log_ratio=distribution.log_prob(output.policy, batch.action) - batch.log_prob,
@@ -166,24 +179,48 @@ def choose(
     return state._replace(sampler=carried), choice
 
 
-def drawn_length(parts: Parts) -> int:
-    """K: the most rows that one epoch draws."""
+def drawn_length(parts: Parts, draws: bool = False) -> int:
+    """K: the most rows that one epoch draws; of a recurrent policy, sequences.
+
+    Args:
+      draws: whether the choice gives probabilities; read of a recurrent policy alone. A mask may
+        have a row in every sequence.
+    """
     config, sampler = parts.config, parts.rules.sampler
     rows = pool_rows(config)
+    if config.recurrent != "none":
+        if not draws:
+            return units(config)
+        rows //= config.sequence_length
     if sampler is None or config.selection_losses == "policy":
         return rows
     return min(rows, max(1, math.ceil(sampler.share * rows - 1e-6)))
 
 
-def _drawn(choice: Choice, batch: Batch, order: Array, key: Array, parts: Parts) -> Draw:
-    """One epoch's rows. If a rule touches the policy loss alone, the critic sees all rows."""
+def _value_probability(choice: Choice, batch: Batch, parts: Parts) -> Any:
+    """What value rows of their own are drawn by `[M]`; None if they are those of the policy loss.
+
+    If a rule that draws touches the policy loss alone, the critic sees all rows.
+    """
+    if parts.config.selection_losses != "policy":
+        return choice.value_probability
+    if choice.probability is None:
+        return None
     present = batch.weight > 0
-    if parts.config.selection_losses == "policy":
-        if choice.probability is None:
-            choice = Choice(keep=present)
-        else:
-            choice = choice._replace(value_probability=present / jnp.sum(present))
-    return draw(choice, order, key, drawn_length(parts))
+    return present / jnp.sum(present)
+
+
+def _drawn(
+    choice: Choice, batch: Batch, rollout: Rollout, order: Array, key: Array, parts: Parts
+) -> Draw:
+    """One epoch's rows. If a rule touches the policy loss alone, the critic sees all rows."""
+    choice = choice._replace(value_probability=_value_probability(choice, batch, parts))
+    if parts.config.selection_losses == "policy" and choice.probability is None:
+        choice = Choice(keep=batch.weight > 0)
+    length = drawn_length(parts, choice.probability is not None)
+    if rollout.memory is not None:
+        choice = choice_of_sequences(choice, batch, rollout, parts.config.sequence_length)
+    return draw(choice, order, key, length)
 
 
 def _epoch(
@@ -191,23 +228,34 @@ def _epoch(
     totals: Totals,
     batch: Batch,
     choice: Choice,
+    rollout: Rollout,
     hypers: Hypers,
-    order: Array,
-    key: Array,
+    draws: tuple[Array, Array],
     *,
     parts: Parts,
 ) -> tuple[TrainState, Totals]:
-    config = parts.config
-    drawn = _drawn(choice, batch, order, key, parts)
-    mode = config.selection_mode
-    full = config.rollout_steps * config.envs // config.minibatches
-    size = minibatch_size(mode, full, config.minibatches, drawn_length(parts))
+    """One epoch; `draws` are the order of its rows and the key of its draws."""
+    config, (order, key) = parts.config, draws
+    drawn = _drawn(choice, batch, rollout, order, key, parts)
+    mode, length = config.selection_mode, 1
+    if rollout.memory is not None:
+        length = config.sequence_length
+        if config.filter != "none" and config.dropped == "replace":
+            mode = "smaller"  # as many gradient steps as PPO's, however many rows were dropped
+    full = config.rollout_steps * config.envs // length // config.minibatches
+    longest = drawn_length(parts, choice.probability is not None)
+    size = minibatch_size(mode, full, config.minibatches, longest)
     steps = minibatch_count(mode, drawn.number, size, config.minibatches)
-    kept = drawn.number
+    kept = drawn.number * length
     if choice.probability is None:
         kept = jnp.sum(choice.keep, dtype=jnp.int32)
     totals = totals._replace(drawn=totals.drawn + kept, epochs=totals.epochs + 1)
     batch = _standardized(batch, choice, config)
+    part_of: Callable[[Array, Array], Minibatch]
+    part_of = partial(minibatch, batch, choice, drawn, parts=parts)
+    if rollout.memory is not None:
+        values = _value_probability(choice, batch, parts)
+        part_of = minibatches_of_sequences(batch, choice, drawn, rollout, values, parts=parts)
 
     def continues(now: tuple[Array, TrainState, Totals]) -> Array:
         return (now[0] < steps) & ~now[2].stopped
@@ -215,7 +263,7 @@ def _epoch(
     def step(now: tuple[Array, TrainState, Totals]) -> tuple[Array, TrainState, Totals]:
         i, state, totals = now
         places, counts = minibatch_places(mode, i, drawn.number, size, config.minibatches)
-        part = minibatch(batch, choice, drawn, places, counts, parts=parts)
+        part = part_of(places, counts)
         after, losses, norm = gradient_step(state, part, hypers, parts=parts)
         return i + 1, *_counted(totals, state, after, losses, norm, part)
 

@@ -13,7 +13,7 @@ import optax
 from sauna.algorithm.learner import a2c, ppo
 from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
 from sauna.algorithm.learner.optimizers import moved_rate, moves_rate, optimizer, scaling
-from sauna.algorithm.learner.replay import pool_rows
+from sauna.algorithm.learner.sequences import as_rows, outputs, units
 from sauna.algorithm.learner.vex_targets import VexTarget
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.selection.positive import cut_at_zero
@@ -77,10 +77,10 @@ def minibatch_losses(
 ) -> Losses:
     """The algorithm's objective on one minibatch of `B` rows."""
     config, policy, rules = parts.config, parts.policy, parts.rules
-    output = policy.apply(params, minibatch.rows.observation)
-    critic = output
-    if minibatch.value_rows is not minibatch.rows:
-        critic = policy.apply(params, minibatch.value_rows.observation)
+    rows, values = minibatch.rows, minibatch.value_rows
+    output = critic = outputs(policy, params, rows.observation, rows.memory)
+    if values is not rows:
+        critic = outputs(policy, params, values.observation, values.memory)
     objective = a2c.losses if config.algorithm == "a2c" else ppo.losses
     losses = objective(
         output,
@@ -93,9 +93,8 @@ def minibatch_losses(
     )
     if rules.auxiliary is None:
         return losses
-    rows = minibatch.value_rows
     extra = rules.auxiliary(
-        critic.prediction, rows.observation, rows.next_observation, rows.next_weight
+        critic.prediction, values.observation, values.next_observation, values.next_weight
     )
     return losses._replace(total=losses.total + config.auxiliary_coef * extra)
 
@@ -126,18 +125,19 @@ def update_on_all(
     """`epochs` passes over `batch` in `minibatches` shuffled parts each.
 
     Args:
-      batch: `[T * N]` samples.
-      order: `[epochs, T * N]` int32, a permutation of the samples for each epoch. Given rather
+      batch: `[T * N]` samples, or sequences `[K, L]` of a recurrent policy.
+      order: `[epochs, T * N]` (or `[epochs, K]`) int32, a permutation for each epoch. Given rather
         than drawn here, because XLA's sort on CPU would take a quarter of the update's time.
 
     Returns:
       the new state, the mean losses, and the mean gradient norm before clipping.
     """
 
-    def step(state: TrainState, rows: Array) -> tuple[TrainState, tuple[Losses, Array]]:
-        part = jax.tree.map(lambda x: x[rows], batch)
+    def step(state: TrainState, places: Array) -> tuple[TrainState, tuple[Losses, Array]]:
+        part = jax.tree.map(lambda x: x[places], batch)
+        rows = part if part.memory is None else as_rows(part)
         state, losses, norm = gradient_step(
-            state, plain_minibatch(part, parts), hypers, parts=parts
+            state, plain_minibatch(rows, parts), hypers, parts=parts
         )
         return state, (losses, norm)
 
@@ -147,17 +147,17 @@ def update_on_all(
 
 
 def minibatch_order(config: Config, seed: int, iteration: int) -> np.ndarray:
-    """The order of the samples in every epoch of an update, `[epochs, M]` int32."""
-    samples = np.arange(pool_rows(config), dtype=np.int32)
+    """The order of the samples (or sequences) in every epoch of an update, `[epochs, M]` int32."""
+    samples = np.arange(units(config), dtype=np.int32)
     generator = np.random.default_rng([seed, iteration])
     return generator.permuted(np.tile(samples, (config.epochs, 1)), axis=1)
 
 
 def device_minibatch_order(config: Config, key: Array, length: int | None = None) -> Array:
-    """The order of the samples in every epoch `[epochs, M]`, or of the first `length` rows.
+    """The order of samples (or sequences) in every epoch `[epochs, M]`, or of the first `length`.
 
     A permutation is a sort here, so that one of fewer rows takes less time.
     """
-    number = length or pool_rows(config)
+    number = length or units(config)
     keys = jax.random.split(key, config.epochs)
     return jax.vmap(lambda key: jax.random.permutation(key, number))(keys)

@@ -21,12 +21,14 @@ class Distribution(NamedTuple):
 
     Attributes:
       num_outputs: outputs that the policy head must have.
-      has_log_std: whether a state-independent log-std is appended to the head's output.
+      has_log_std: whether a log-std is appended to the head's output, which is the mean.
       draw: `(key, shape) -> noise [*shape, M]`.
       sample: `(parameters [..., K], noise [..., M]) -> action [..., A]`.
       log_prob: `(parameters [..., K], action [..., A]) -> [...]`.
       entropy: `parameters [..., K] -> [...]`.
       mode: `parameters [..., K] -> action [..., A]`.
+      continuous: whether `log_prob` is that of a density.
+      bounded: whether an action here is what a tanh bounds: see `policy/bounded.py`.
     """
 
     num_outputs: int
@@ -36,6 +38,8 @@ class Distribution(NamedTuple):
     log_prob: Callable[[Array, Array], Array]
     entropy: Callable[[Array], Array]
     mode: Callable[[Array], Array]
+    continuous: bool = False
+    bounded: bool = False
 
 
 def gaussian(size: int) -> Distribution:
@@ -63,7 +67,9 @@ def gaussian(size: int) -> Distribution:
     def draw(key: Array, shape: tuple[int, ...]) -> Array:
         return jax.random.normal(key, (*shape, size), jnp.float32)
 
-    return Distribution(size, True, draw, sample, log_prob, entropy, lambda p: split(p)[0])
+    return Distribution(
+        size, True, draw, sample, log_prob, entropy, lambda p: split(p)[0], continuous=True
+    )
 
 
 def multi_categorical(sizes: tuple[int, ...]) -> Distribution:

@@ -7,12 +7,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Array
 from sauna.config.settings import Config
+from sauna.envs.masked import MASK, OBSERVATION, flat_masks, is_masked
 from sauna.envs.shapes import batch_size, one_of
 from sauna.envs.spaces import Spaces, action_writer, observation_reader
+from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system.errors import BadInput
 
 
@@ -20,6 +23,9 @@ class FrozenPolicy:
     """`policy(observation) -> action` for a raw observation of the environment, or a batch.
 
     The action is the distribution's mode unless `deterministic=False` and a key are given.
+
+    A recurrent policy remembers the observations that it is called with: call `reset` at the start
+    of an episode.
 
     Args:
       config: whose network and normalisation it has.
@@ -29,12 +35,14 @@ class FrozenPolicy:
 
     def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
         self.config = config
-        self._space = env.observation_space
-        self._read = observation_reader(env.observation_space)
-        self.write = action_writer(env.action_space, config.rescale_actions)
+        self._space = wrapped_space(env, wrapping_of(config))
+        self._sizes = spaces.action_sizes if spaces.mask else ()  # of the masks
+        self._read = observation_reader(self._space)
+        self._write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
         self.policy: Policy = make_policy(config, spaces)
         self.params: Any = None
+        self.state: Any = ()  # [n, H] of a recurrent policy; () before an episode's first step
         self._moments: Moments | None = None
         self._act = jax.jit(self._choose, static_argnames="deterministic")
         self._predict = jax.jit(self._heads)
@@ -43,32 +51,81 @@ class FrozenPolicy:
     def load(self, params: Array, moments: Moments | None) -> None:
         """Takes over parameters `[D]` and moments of `[obs]`; None: nothing is normalised."""
         self.params, self._moments = jax.numpy.asarray(params), moments
+        self.reset()
 
-    def _choose(self, params: Array, observation: Any, key: Any, *, deterministic: bool) -> Any:
+    def reset(self, ended: Any = None) -> None:
+        """Forgets what was observed; a policy that is not recurrent has nothing to forget.
+
+        Args:
+          ended: `[n]` bool, which of a batch's episodes have ended; default all.
+        """
+        if ended is None or isinstance(self.state, tuple):
+            self.state = ()
+        else:
+            over = np.asarray(ended, bool).reshape(-1)
+            self.state = np.where(over[:, None], np.float32(0.0), self.state)
+
+    def _choose(
+        self, params: Array, observation: Any, state: Any, key: Any, *, deterministic: bool
+    ) -> Any:
         distribution = self.policy.distribution
-        parameters = self.policy.apply(params, observation).policy
+        output, state = self.policy.step(params, observation, state)
         if deterministic:
-            return distribution.mode(parameters)
-        return distribution.sample(parameters, distribution.draw(key, parameters.shape[:-1]))
+            return distribution.mode(output.policy), state
+        noise = distribution.draw(key, output.policy.shape[:-1])
+        return self.policy.sample(params, output, noise), state
 
-    def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
+    def __call__(
+        self,
+        observation: Any,
+        *,
+        deterministic: bool = True,
+        key: Any = None,
+        action_mask: Any = None,
+    ) -> Any:
         """The action for a raw observation, clipped or stretched as the environment wants it.
 
         A batch of observations (each array with one more axis, in front) gives an array of actions.
         Each new size of a batch is compiled once. Sampled actions need a JAX `key`; the normaliser
         is never updated.
 
+        Args:
+          action_mask: of the valid actions, `[K]` or `[n, K]`, for a policy that was trained with
+            masks.
+
         Raises:
-          BadInput: `observation` is not of the environment's space.
+          BadInput: `observation` is not of the environment's space, the mask is none, or a
+            recurrent policy has another number of episodes to remember.
         """
-        rows, is_batch = self._rows(observation)
+        rows, is_batch = self._rows(self._with_mask(observation, action_mask))
         actions = self._choices(rows, deterministic, key)
         if is_batch:
             return np.stack([np.asarray(self.write(action)) for action in actions])
         return self.write(actions[0])
 
+    def _with_mask(self, observation: Any, action_mask: Any) -> Any:
+        """An observation together with its mask, as the space of masked observations has it."""
+        if action_mask is None:
+            if self._sizes and not is_masked(observation):
+                raise BadInput(
+                    "action_mask: this policy was trained with masks; "
+                    "call policy(observation, action_mask=mask)"
+                )
+            return observation
+        if not self._sizes:
+            raise BadInput("action_mask: not read by a policy that was trained without masks")
+        try:
+            masks = flat_masks(action_mask, self._sizes)
+        except ValueError as error:
+            raise BadInput(f"action_mask: {error}") from None
+        return {OBSERVATION: observation, MASK: masks}
+
+    def write(self, action: np.ndarray) -> Any:
+        """What the environment takes of what the network chooses `[A]`."""
+        return self._write(to_env(self.policy.distribution, action))
+
     def act(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> np.ndarray:
-        """What the network chooses for one raw observation `[A]`, neither clipped nor stretched."""
+        """What the network chooses for one raw observation `[A]`, as a rollout holds it."""
         return self._choices(self._read(observation)[None], deterministic, key)[0]
 
     def _choices(self, rows: np.ndarray, deterministic: bool, key: Any) -> np.ndarray:
@@ -76,8 +133,26 @@ class FrozenPolicy:
         if not deterministic and key is None:
             raise ValueError("a sampled action needs key=jax.random.key(...)")
         key = jax.random.key(0) if key is None else key
-        seen = self._seen(rows)
-        return np.asarray(self._act(self.params, seen, key, deterministic=deterministic))
+        state = self.state_for(len(rows))
+        actions, self.state = self._act(
+            self.params, self._seen(rows), state, key, deterministic=deterministic
+        )
+        return np.asarray(actions)
+
+    def state_for(self, number: int) -> Any:
+        """The states `[number, H]` with which as many episodes go on, or begin.
+
+        Raises:
+          BadInput: another number of episodes goes on.
+        """
+        if isinstance(self.state, tuple):
+            return self.policy.initial_state(number)
+        if len(self.state) != number:
+            raise BadInput(
+                f"a recurrent policy remembers {len(self.state)} episodes, and got observations of "
+                f"{number}; call reset() first"
+            )
+        return self.state
 
     def _rows(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Raw observations as arrays `[n, *obs]`, and whether they came as a batch."""

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 
 from sauna.algorithm.policy.convolutions import LAYERS, Layer, convolutions
+from sauna.algorithm.policy.gsde import deviation, state_log_std
 from sauna.algorithm.types import Array, PolicyOutput
 
 
@@ -88,6 +91,13 @@ class NatureCNN(nn.Module):
         return x.reshape((*lead, -1))
 
 
+class StateNoise(NamedTuple):
+    """How gSDE's noise depends on the features; see `gsde.py`."""
+
+    expln: bool  # the standard deviation of a log-std above 0 grows slowly
+    learn_features: bool  # the gradient of the log-std goes into the features
+
+
 class ActorCritic(nn.Module):
     """Policy, value and Vex heads on a shared trunk or on two separate ones.
 
@@ -97,9 +107,11 @@ class ActorCritic(nn.Module):
     Attributes:
       make_trunk: builds the trunk module under a given name, as a part of a given module.
       num_outputs: width of the policy head.
-      log_std_init: start of the state-independent log-std, or None for discrete actions.
+      log_std_init: start of the log-std, or None for a distribution without one.
       shared: one trunk for all heads.
       predicted: width of the auxiliary head, which stands beside the value head; 0: there is none.
+      make_cell: builds the recurrent cell behind a trunk, by its name; None: nothing is remembered.
+      noise: how the log-std depends on the last hidden layer; None: it does not.
     """
 
     make_trunk: Callable[[str, nn.Module], nn.Module]
@@ -107,24 +119,56 @@ class ActorCritic(nn.Module):
     log_std_init: float | None
     shared: bool
     predicted: int = 0
+    make_cell: Callable[[str], nn.Module] | None = None
+    noise: StateNoise | None = None
 
     @nn.compact
-    def __call__(self, observation: Array) -> PolicyOutput:
-        """`[..., *obs]` -> `PolicyOutput` with leading axes `[...]`."""
+    def __call__(
+        self, observation: Array, start: Array | None = None, state: Any = ()
+    ) -> PolicyOutput:
+        """`[..., *obs]` -> `PolicyOutput` with leading axes `[...]`.
+
+        Args:
+          observation: `[L, B, *obs]`, in time order, if there are cells.
+          start: `[L, B]` bool, where an episode starts; state: `[B, H]` before the first step, the
+            policy's cell first. Of cells alone.
+        """
         first = self.make_trunk("trunk" if self.shared else "policy_trunk", self)
         policy_features = first(observation)
         value_features = (
             policy_features if self.shared else self.make_trunk("value_trunk", self)(observation)
         )
+        if self.make_cell is not None:
+            own = jnp.split(state, 1 if self.shared else 2, -1)
+            name = "cell" if self.shared else "policy_cell"
+            policy_features, state = self.make_cell(name)(policy_features, start, own[0])
+            if self.shared:
+                value_features = policy_features
+            else:
+                value_cell = self.make_cell("value_cell")
+                value_features, of_value = value_cell(value_features, start, own[1])
+                state = jnp.concatenate([state, of_value], -1)
         hidden = policy_features
         policy = dense(self.num_outputs, 0.01, "policy_head")(policy_features)
         if self.log_std_init is not None:
-            start = nn.initializers.constant(self.log_std_init)
-            log_std = self.param("log_std", start, (self.num_outputs,))
+            log_std = self._log_std(hidden, self.log_std_init)
             policy = jnp.concatenate([policy, jnp.broadcast_to(log_std, policy.shape)], -1)
         value = dense(1, 1.0, "value_head")(value_features)[..., 0]
         vex = dense(1, 1.0, "vex_head")(value_features)[..., 0]
         prediction = None
         if self.predicted:
             prediction = dense(self.predicted, 1.0, "auxiliary_head")(value_features)
-        return PolicyOutput(policy, value, vex, hidden, prediction)
+        return PolicyOutput(policy, value, vex, hidden, prediction, state)
+
+    def _log_std(self, hidden: Array, first: float) -> Array:
+        """The log-std `[A]`; one that depends on the state is `[..., A]`, of a matrix `[H, A]`.
+
+        The matrix begins where features of size 1 give the log-std `first`, however many there are.
+        """
+        if self.noise is None:
+            return self.param("log_std", nn.initializers.constant(first), (self.num_outputs,))
+        width = hidden.shape[-1]
+        start = nn.initializers.constant(first - 0.5 * math.log(width))
+        log_std = self.param("log_std", start, (width, self.num_outputs))
+        features = hidden if self.noise.learn_features else jax.lax.stop_gradient(hidden)
+        return state_log_std(features, deviation(log_std, self.noise.expln))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 EPSILON = 1e-8  # added to the variance before the square root, as VecNormalize does
@@ -36,10 +37,10 @@ def update_moments(moments: Moments, batch: Any, active: Any) -> Moments:
 
     Args:
       moments: of `[..., D]`.
-      batch: `[..., N, D]`.
+      batch: `[..., N, >= D]`, of which the first D numbers are seen.
       active: `[..., N]` bool; other rows count for nothing. Where none is, nothing changes.
     """
-    batch_mean, batch_variance, number = _moments_of(batch, active)
+    batch_mean, batch_variance, number = _moments_of(_with_moments(batch, moments)[0], active)
     total = moments.count + number
     fraction = number / total
     delta = batch_mean - moments.mean
@@ -102,7 +103,7 @@ def update_long_moments(moments: LongMoments, batch: Any, active: Any) -> LongMo
 
     `mean += f d` and `var += f (var_b - var_a + (1 - f) d^2)`.
     """
-    batch_mean, batch_variance, number = _moments_of(batch, active)
+    batch_mean, batch_variance, number = _moments_of(_with_moments(batch, moments)[0], active)
     fraction = number / (moments.count + number)
     delta = batch_mean - moments.mean
     spread = batch_variance - moments.variance + (1.0 - fraction) * delta**2
@@ -110,9 +111,22 @@ def update_long_moments(moments: LongMoments, batch: Any, active: Any) -> LongMo
 
 
 def normalize(moments: Moments, batch: Any, clip: float) -> Any:
-    """`clip((x - mean) / sqrt(var + eps), +-clip)` of `[..., N, D]`."""
+    """`clip((x - mean) / sqrt(var + eps), +-clip)` of the first D numbers of `[..., N, >= D]`."""
     mean, variance = moments.mean[..., None, :], moments.variance[..., None, :]
-    return ((batch - mean) / (variance + EPSILON) ** 0.5).clip(-clip, clip)
+    first, rest = _with_moments(batch, moments)
+    scaled = ((first - mean) / (variance + EPSILON) ** 0.5).clip(-clip, clip)
+    if rest is None:
+        return scaled
+    library = np if isinstance(batch, np.ndarray) else jnp
+    return library.concatenate([scaled, rest.astype(scaled.dtype)], -1)
+
+
+def _with_moments(batch: Any, moments: Moments | LongMoments) -> tuple[Any, Any]:
+    """The first D numbers, which have moments, and the rest; None if there is none."""
+    size = moments.mean.shape[-1]
+    if batch.shape[-1] == size:
+        return batch, None
+    return batch[..., :size], batch[..., size:]
 
 
 def moments_after_each(moments: Moments, values: Any, valid: Any) -> Moments:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from sauna.algorithm.policy.convolutions import Layer, convolution, in_pieces, joined
 from sauna.algorithm.policy.networks import Convolution, dense
 from sauna.algorithm.types import Array
-from sauna.envs.spaces import channels_first
+from sauna.envs.pictures import channels_first
 
 
 class SmallCNN(nn.Module):

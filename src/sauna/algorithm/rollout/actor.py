@@ -14,12 +14,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from sauna.algorithm.policy.gsde import deviation
+from sauna.algorithm.policy.observation import INVALID
 from sauna.algorithm.policy.policy import Policy
+from sauna.algorithm.rollout.memory import HostMemory
 from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces
 from sauna.system.compiled import compiled
 
+APART, ADDED, MATRIX = range(3)  # how `_act` adds noise to the policy head's outputs
 _TANH, _RELU, _ELU, _GELU, _LEAKY_RELU, _SELU, _SIGMOID = range(7)  # places in ACTIVATIONS
 
 
@@ -60,6 +64,19 @@ class CompiledActor:
         return np.asarray(self._act(self._params, observation, noise))
 
 
+class RecurrentActor(CompiledActor):
+    """Acts by `Program.act` with the states of `memory`, and moves them on."""
+
+    def __init__(self, act: Any, memory: HostMemory) -> None:
+        super().__init__(act)
+        self._memory = memory
+
+    def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        action, state = self._act(self._params, observation, noise, self._memory.state)
+        self._memory.advance(np.asarray(state))
+        return np.asarray(action)
+
+
 class MLPActor:
     """Acts by a compiled loop, for the MLP trunks of `policy/networks.py`.
 
@@ -68,11 +85,13 @@ class MLPActor:
     """
 
     def __init__(self, config: Config, spaces: Spaces, policy: Policy, members: int) -> None:
-        self._policy, self._sample = policy, _sampler(spaces)
+        self._policy, self._sample = policy, _sampler(config, spaces)
+        self._expln, self._adds = config.sde_expln, _noise_kind(config, spaces)
         self._trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
         self._function = ACTIVATIONS.index(config.activation)
         self._layers = [f"layer_{i}" for i in range(len(config.hidden))]
-        widths = [spaces.observation_shape[0], *config.hidden, policy.distribution.num_outputs]
+        widths = [spaces.numbers, *config.hidden, policy.distribution.num_outputs]
+        self._mask = spaces.mask
         self._weights = tuple(
             np.zeros((members, before + 1, after), np.float32)
             for before, after in itertools.pairwise(widths)
@@ -81,7 +100,10 @@ class MLPActor:
         self._norms = tuple(
             np.zeros((members, 2 * config.layer_norm, width), np.float32) for width in config.hidden
         )
-        self._scale = np.ones((members, 1, widths[-1]), np.float32)
+        self._scale: Any = np.float32(1.0)
+        if policy.distribution.has_log_std:
+            features = widths[-2] if self._adds == MATRIX else 1
+            self._scale = np.ones((members, 1, features * widths[-1]), np.float32)
 
     def load(self, params: np.ndarray) -> None:
         for p, vector in enumerate(params):
@@ -92,17 +114,19 @@ class MLPActor:
             for i, norm in enumerate(self._norms):
                 if len(norm[p]):
                     norm[p] = [tree[self._trunk][f"norm_{i}"][name] for name in ("scale", "bias")]
-            if "log_std" in tree:
+            if self._adds == MATRIX:
+                self._scale[p] = np.asarray(deviation(tree["log_std"], self._expln)).ravel()
+            elif "log_std" in tree:
                 self._scale[p] = np.exp(tree["log_std"])
 
     def prepare(self, noise: np.ndarray) -> np.ndarray:
         return noise * self._scale
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        noisy = np.empty_like(noise)
+        noisy = np.empty((*noise.shape[:2], self._weights[-1].shape[-1]), np.float32)
         form = self._weights, self._norms, self._function
-        _act(observation, *form, self._hidden, noise, noisy)
-        return self._sample(noisy)
+        _act(observation, *form, self._hidden, noise, self._adds, noisy, self._mask)
+        return self._sample(noisy, noise)
 
 
 @compiled
@@ -113,10 +137,17 @@ def _act(
     function: int,
     hidden: Any,
     noise: Any,
+    adds: int,
     noisy: Any,
+    mask: int,
 ) -> None:
-    """Writes the policy head's outputs plus `noise`, member by member, to `noisy` `[P, N, M]`."""
-    last = len(weights) - 1
+    """Writes the policy head's outputs and their noise, member by member, to `noisy` `[P, N, K]`.
+
+    `noise` `[P, N, M]` is added as it is, or as the last hidden layer times a matrix `[H, K]`, or
+    not at all: as `adds` says. The last `mask` numbers of an observation say which actions are
+    valid; 0: all are.
+    """
+    last, first = len(weights) - 1, observation.shape[2] - mask
     for p in range(observation.shape[0]):
         for n in range(observation.shape[1]):
             x = observation[p, n]
@@ -134,8 +165,16 @@ def _act(
                 x = y
             y = noisy[p, n]
             _affine(x, weights[last][p], y)
-            for j in range(len(y)):
-                y[j] += noise[p, n, j]
+            if adds == ADDED:
+                for j in range(len(y)):
+                    y[j] += noise[p, n, j]
+            elif adds == MATRIX:
+                for k in range(len(x)):
+                    for j in range(len(y)):
+                        y[j] += x[k] * noise[p, n, k * len(y) + j]
+            for j in range(mask):
+                if observation[p, n, first + j] == 0:
+                    y[j] = np.float32(INVALID)
 
 
 @compiled
@@ -205,20 +244,66 @@ def _tanh(y: Any) -> None:
         y[j] = x * p / q
 
 
-def _sampler(spaces: Spaces) -> Callable[[np.ndarray], np.ndarray]:
-    """From the policy head's outputs plus noise to actions, as `policy/distributions.py` has it."""
+@compiled
+def _beta(heads: Any, noise: Any, actions: Any) -> None:
+    """Writes Beta variates of the outputs `heads` `[P, N, 2 A]`: see `policy/bounded.py`."""
+    size, one = actions.shape[-1], np.float32(1)
+    tries = noise.shape[-1] // (4 * size)
+    for p in range(heads.shape[0]):
+        for n in range(heads.shape[1]):
+            for i in range(2 * size):
+                output = heads[p, n, i]
+                soft = max(output, np.float32(0)) + np.log1p(np.exp(-abs(output)))
+                d = one + soft - one / np.float32(3)
+                c = one / np.sqrt(np.float32(9) * d)
+                taken = np.float32(0)
+                for k in range(i * tries, (i + 1) * tries):
+                    z, e = noise[p, n, k], noise[p, n, 2 * size * tries + k]
+                    root = one + z * c
+                    log_v = np.float32(3) * np.log(max(root, np.float32(1e-3)))
+                    if k == i * tries:
+                        taken = log_v
+                    bound = np.float32(0.5) * z * z + d * (one - root * root * root + log_v)
+                    if root > np.float32(1e-3) and -e < bound:
+                        taken = log_v
+                        break
+                half = np.float32(0.5) * (np.log(d) + taken)
+                if i < size:
+                    actions[p, n, i] = half
+                else:
+                    actions[p, n, i - size] -= half
+
+
+def _sampler(config: Config, spaces: Spaces) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """From the policy head's outputs plus noise to actions, as `policy/distributions.py` has it.
+
+    Where `_act` adds no noise, the second argument has it.
+    """
     if spaces.action_kind == "continuous":
-        return lambda noisy: noisy
+        return _beta_sample if config.distribution == "beta" else lambda noisy, noise: noisy
     if spaces.action_kind == "multi_binary":
-        return lambda noisy: (noisy > 0).astype(np.int32)
+        return lambda noisy, noise: (noisy > 0).astype(np.int32)
     ends = np.cumsum(spaces.action_sizes)
 
-    def largest(noisy: np.ndarray) -> np.ndarray:
+    def largest(noisy: np.ndarray, noise: np.ndarray) -> np.ndarray:
         chosen = np.empty((*noisy.shape[:-1], len(ends)), np.int32)
         _largest(noisy, ends, chosen)
         return chosen
 
     return largest
+
+
+def _beta_sample(heads: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    actions = np.empty((*heads.shape[:-1], heads.shape[-1] // 2), np.float32)
+    _beta(heads, noise, actions)
+    return actions
+
+
+def _noise_kind(config: Config, spaces: Spaces) -> int:
+    """How `_act` adds the noise of the distribution."""
+    if spaces.action_kind != "continuous":
+        return ADDED
+    return {"beta": APART, "gsde": MATRIX}.get(config.distribution, ADDED)
 
 
 @compiled
@@ -240,8 +325,17 @@ def _largest(logits: Any, ends: Any, chosen: Any) -> None:
                 start = ends[i]
 
 
-def make_actor(config: Config, spaces: Spaces, policy: Policy, act: Any, members: int) -> Actor:
-    """The fastest actor for the network of `config`."""
-    if config.network == "mlp" and len(spaces.observation_shape) == 1:
+def make_actor(
+    config: Config,
+    spaces: Spaces,
+    policy: Policy,
+    act: Any,
+    members: int,
+    memory: HostMemory | None = None,
+) -> Actor:
+    """The fastest actor for the network of `config`; `memory` is read if it is recurrent."""
+    if policy.state_size and memory is not None:
+        return RecurrentActor(act, memory)
+    if config.network == "mlp" and len(spaces.observation_shape) == 1 and not spaces.pictures:
         return MLPActor(config, spaces, policy, members)
     return CompiledActor(act)

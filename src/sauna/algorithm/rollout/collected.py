@@ -37,3 +37,11 @@ def capacity(config: Config) -> int:
     if config.filter == "none" or config.dropped == "mask":
         return config.rollout_steps
     return config.rollout_steps * config.max_env_steps_factor
+
+
+def chunk_sizes(rollout_steps: int) -> list[int]:
+    """Lengths that segments are padded to, rising: T, and T over powers of 4 down to 32."""
+    sizes = [rollout_steps]
+    while sizes[0] >= 128:
+        sizes.insert(0, -(-sizes[0] // 4))
+    return sizes

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import (
     LongMoments,
     initial_moments,
@@ -28,7 +29,7 @@ from sauna.algorithm.policy.normalize import (
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.program import draw_noise
-from sauna.algorithm.types import Array, Hypers, Keys, Rollout, ScoredStep, StepFilter
+from sauna.algorithm.types import Array, Hypers, Keys, Memory, Rollout, ScoredStep, StepFilter
 from sauna.config.settings import Config
 from sauna.envs.device.contract import JaxEnv, Running, Transition, advance, begin
 
@@ -45,6 +46,7 @@ class CollectState(NamedTuple):
     discounted_return: Array  # [N] float32
     episode_return: Array  # [N] float32, raw rewards so far
     episode_length: Array  # [N] int32
+    memory: Any = ()  # [N, H] float32, the states of a recurrent policy
 
 
 class Ends(NamedTuple):
@@ -79,6 +81,7 @@ class Collecting(NamedTuple):
     policy: Policy
     filter: StepFilter | None
     any_member: Callable[[Array], Array]  # see `jax_env.advance`
+    normalized: int  # numbers of an observation, the first, that have running moments
 
 
 class _Row(NamedTuple):
@@ -106,6 +109,7 @@ class _Carry(NamedTuple):
     state: CollectState
     filter: Any
     kept: Array  # [N] int32
+    chunks: Any = None  # [C, N, H] states before each chunk of a recurrent policy
 
 
 def start(parts: Collecting, key: Array) -> CollectState:
@@ -114,10 +118,11 @@ def start(parts: Collecting, key: Array) -> CollectState:
     envs = begin(parts.env, key, config.envs, cached=config.reset == "cached")
     moments: Any = ()
     if config.normalize_observations:
-        moments = _first_moments(envs.observation.shape[-1])
+        moments = _first_moments(parts.normalized)
         moments = update_long_moments(moments, envs.observation, jnp.ones(config.envs, bool))
     zeros = jnp.zeros(config.envs, jnp.float32)
-    return CollectState(envs, moments, _first_moments(1), zeros, zeros, zeros.astype(jnp.int32))
+    lengths, memory = zeros.astype(jnp.int32), parts.policy.initial_state(config.envs)
+    return CollectState(envs, moments, _first_moments(1), zeros, zeros, lengths, memory)
 
 
 def _first_moments(size: int) -> LongMoments:
@@ -145,19 +150,24 @@ def collect(
     noise = _noise(parts, keys.action, iteration)
     filter_key = jax.random.fold_in(keys.filter, iteration)
     filter_state = parts.filter.init(config.envs, max_rows) if parts.filter else ()
-    carry = _Carry(jnp.int32(0), state, filter_state, jnp.zeros(config.envs, jnp.int32))
+    chunks = None
+    if parts.policy.state_size:
+        chunks = parts.policy.initial_state(max_rows // config.sequence_length, config.envs)
+    kept = jnp.zeros(config.envs, jnp.int32)
+    carry = _Carry(jnp.int32(0), state, filter_state, kept, chunks)
     begun = _finite_rows(state.envs.observation)  # the run's first ones no step has looked at
 
     def step(carry: _Carry) -> tuple[_Carry, _Row]:
         acting = (carry.kept < config.rollout_steps) & (carry.t < limit)
         key = jax.random.fold_in(filter_key, carry.t)
-        return _step(parts, params, carry, noise[carry.t], acting, keys.env, key, hypers)
+        own = noise[_noise_row(parts, carry.t)]
+        return _step(parts, params, carry, own, acting, keys.env, key, hypers)
 
     if max_rows == config.rollout_steps:  # every env acts in every row: a plain scan
         carry, rows = jax.lax.scan(lambda c, _: step(c), carry, length=max_rows)
     else:
         carry, rows = _until_full(parts, step, carry, max_rows, limit)
-    return _finish(parts, params, carry.state, rows, begun, hypers)
+    return _finish(parts, params, carry, rows, begun, hypers)
 
 
 def _until_full(
@@ -188,11 +198,19 @@ def _until_full(
 
 
 def _noise(parts: Collecting, key: Array, iteration: Array) -> Array:
-    """Action noise of all rows `[S, N, M]`, drawn T rows at a time as the host does."""
+    """Action noise of all rows `[S / hold, N, M]`, drawn T rows at a time as the host does."""
     config = parts.config
     blocks = jnp.arange(capacity(config) // config.rollout_steps)
     noise = jax.vmap(lambda block: draw_noise(parts.policy, config, key, iteration, block))(blocks)
     return noise.reshape((-1, *noise.shape[2:]))
+
+
+def _noise_row(parts: Collecting, t: Array) -> Array:
+    """The row of `_noise` that env step `t` of a rollout has."""
+    hold, block = parts.policy.hold, parts.config.rollout_steps
+    if hold == 1:
+        return t
+    return t // block * -(-block // hold) + t % block // hold
 
 
 def _seen(parts: Collecting, moments: LongMoments | tuple[()], raw: Array) -> Array:
@@ -215,15 +233,16 @@ def _step(
     """Acts once everywhere that `acting` `[N]` says."""
     policy, state = parts.policy, carry.state
     observation = _seen(parts, state.observation_moments, state.envs.observation)
-    output = policy.apply(params, observation)
-    action = policy.distribution.sample(output.policy, noise)
+    output, memory = policy.step(params, observation, state.memory)
+    action = policy.sample(params, output, noise)
     keep, filter_state = acting, carry.filter
     if parts.filter is not None:
         log_prob = policy.distribution.log_prob(output.policy, action)
         scored = ScoredStep(observation, action, log_prob, output.value, output.vex)
         filter_state, decided = parts.filter.keep(carry.filter, scored, filter_key, hypers)
         keep = decided & acting
-    envs, transition = advance(parts.env, state.envs, action, acting, env_key, parts.any_member)
+    shown = to_env(policy.distribution, action)
+    envs, transition = advance(parts.env, state.envs, shown, acting, env_key, parts.any_member)
     moments = state.observation_moments
     if isinstance(moments, LongMoments):
         moments = update_long_moments(moments, envs.observation, acting)
@@ -231,11 +250,13 @@ def _step(
     ended = transition.terminated | transition.truncated
     episode_return = state.episode_return + reward
     episode_length = state.episode_length + acting
+    reached = _where(acting, memory, state.memory)
     after = state._replace(
         envs=envs,
         observation_moments=moments,
         episode_return=jnp.where(ended, 0.0, episode_return),
         episode_length=jnp.where(ended, 0, episode_length),
+        memory=_where(~ended, reached, policy.initial_state(len(ended))),
     )
     row = _Row(
         observation,
@@ -243,7 +264,7 @@ def _step(
         policy.distribution.log_prob(output.policy, action),
         reward,
         output.value,
-        _final_values(parts, params, moments, transition),
+        _final_values(parts, params, moments, reached, transition),
         output.vex,
         transition.terminated,
         transition.truncated,
@@ -254,7 +275,22 @@ def _step(
         ~acting | _finite_rows(transition.observation, envs.observation, reward),
         transition.info,
     )
-    return _Carry(carry.t + 1, after, filter_state, carry.kept + keep), row
+    chunks = _noted(parts.config, carry)
+    return _Carry(carry.t + 1, after, filter_state, carry.kept + keep, chunks), row
+
+
+def _noted(config: Config, carry: _Carry) -> Any:
+    """The states before each chunk, with those of now if one begins; None of other policies."""
+    if carry.chunks is None:
+        return None
+    place, begins = carry.t // config.sequence_length, carry.t % config.sequence_length == 0
+    now = jnp.where(begins, carry.state.memory, carry.chunks[place])
+    return carry.chunks.at[place].set(now)
+
+
+def _where(mask: Array, yes: Any, no: Any) -> Any:
+    """States `[N, H]`: `yes` where `mask` `[N]`, else `no`; () of a policy that has none."""
+    return jax.tree.map(lambda a, b: jnp.where(mask[:, None], a, b), yes, no)
 
 
 def _finite_rows(*arrays: Array) -> Array:
@@ -264,14 +300,19 @@ def _finite_rows(*arrays: Array) -> Array:
 
 
 def _final_values(
-    parts: Collecting, params: Array, moments: LongMoments | tuple[()], transition: Transition
+    parts: Collecting,
+    params: Array,
+    moments: LongMoments | tuple[()],
+    memory: Any,
+    transition: Transition,
 ) -> Array:
     """V `[N]` of what truncated episodes had reached; 0 elsewhere, and computed only for some."""
     if parts.config.truncation != "bootstrap":
         return jnp.zeros(transition.reward.shape)
 
     def values() -> Array:
-        return parts.policy.apply(params, _seen(parts, moments, transition.observation)).value
+        seen = _seen(parts, moments, transition.observation)
+        return parts.policy.step(params, seen, memory)[0].value
 
     some = parts.any_member(jnp.any(transition.truncated))
     found = jax.lax.cond(some, values, lambda: jnp.zeros(transition.reward.shape))
@@ -281,13 +322,15 @@ def _final_values(
 def _finish(
     parts: Collecting,
     params: Array,
-    state: CollectState,
+    carry: _Carry,
     rows: _Row,
     begun: Array,
     hypers: Hypers,
 ) -> tuple[CollectState, Rollout, Ends, Faults]:
     """Scales the rewards and looks back over the rows `[S, N]`."""
-    reward, state = _scaled_rewards(parts.config, state, rows, hypers)
+    reward, state = _scaled_rewards(parts.config, carry.state, rows, hypers)
+    ended = rows.terminated | rows.truncated
+    starts = jnp.concatenate([jnp.zeros_like(ended[:1]), ended[:-1]])
     rollout = Rollout(
         rows.observation,
         rows.action,
@@ -300,6 +343,7 @@ def _finish(
         rows.truncated,
         rows.valid,
         rows.keep,
+        None if carry.chunks is None else Memory(starts, carry.chunks),
     )
     return state, rollout, _ends(rows), _faults(rows, begun)
 
@@ -307,7 +351,7 @@ def _finish(
 def _next_values(parts: Collecting, params: Array, state: CollectState, rows: _Row) -> Array:
     """The value of each step's true successor `[S, N]`."""
     seen = _seen(parts, state.observation_moments, state.envs.observation)
-    after = parts.policy.apply(params, seen).value
+    after = parts.policy.step(params, seen, state.memory)[0].value
     following = jnp.concatenate([rows.valid[1:], jnp.zeros_like(rows.valid[:1])])
     later = jnp.concatenate([rows.value[1:], after[None]])
     next_value = jnp.where(following, later, jnp.where(rows.valid, after, 0.0))

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import (
     Moments,
     initial_moments,
@@ -23,7 +24,8 @@ from sauna.algorithm.policy.normalize import (
     scale_rewards,
 )
 from sauna.algorithm.rollout.actor import make_actor
-from sauna.algorithm.rollout.collected import Collected, Episode, capacity
+from sauna.algorithm.rollout.collected import Collected, Episode, capacity, chunk_sizes
+from sauna.algorithm.rollout.memory import HostMemory
 from sauna.algorithm.rollout.moments import ObservationMoments, discounted_returns
 from sauna.algorithm.rollout.program import Program
 from sauna.algorithm.types import Hypers, Keys, Rollout, ScoredStep
@@ -42,6 +44,7 @@ class CollectState(NamedTuple):
     discounted_return: np.ndarray  # [P, N] float64
     episode_return: np.ndarray  # [P, N] float64, raw rewards so far
     episode_length: np.ndarray  # [P, N] int64
+    memory: Any = ()  # [P, N, H] float32, the states of a recurrent policy
 
 
 class _Segment(NamedTuple):
@@ -66,8 +69,11 @@ class HostCollector:
         self._program, self._config, self._spaces = program, program.config, spaces
         self._envs, self._keys = envs, keys
         self._shape = (len(keys), self._config.envs)
-        self._actor = make_actor(self._config, spaces, program.policy, program.act, len(keys))
         self._capacity = capacity(self._config)
+        self._memory = HostMemory(self._config, program.policy, len(keys), self._capacity)
+        self._actor = make_actor(
+            self._config, spaces, program.policy, program.act, len(keys), self._memory
+        )
         # What the policy sees [S + 1, P, N, *obs], rows first: each is written and read as a whole.
         self._observed = np.zeros(
             (self._capacity + 1, *self._shape, *spaces.observation_shape), spaces.observation_dtype
@@ -91,12 +97,13 @@ class HostCollector:
             np.zeros(self._shape),
             np.zeros(self._shape),
             np.zeros(self._shape, np.int64),
+            self._memory.state if program.policy.state_size else (),
         )
 
     def _observation_moments(self) -> ObservationMoments | None:
-        if not self._config.normalize_observations or self._spaces.observation_kind != "vector":
+        size = self._spaces.normalized
+        if not self._config.normalize_observations or not size:
             return None
-        size = self._spaces.observation_shape[0]
         return ObservationMoments(self._shape[0], size, self._config.clip_observations)
 
     def _allocate(self) -> Any:
@@ -111,7 +118,7 @@ class HostCollector:
             arrays[name] = np.zeros(lead, np.float32)
         for name in ("terminated", "truncated", "valid", "keep"):
             arrays[name] = np.zeros(lead, bool)
-        return Rollout(**arrays)
+        return Rollout(**arrays, memory=self._memory.rollout)
 
     def start(self) -> None:
         """Resets every environment; the first observations enter the running moments."""
@@ -142,6 +149,7 @@ class HostCollector:
         if self._uncompiled:
             self._compile_segments(params[0], hypers[0])
         self._actor.load(params)
+        self._memory.begin()
         self._show()
         filters, keys = self._start_filters(), self._filter_keys(iteration)
         plans = [self._plan(member, 0, limit) for member in members]
@@ -154,7 +162,7 @@ class HostCollector:
             until = min(*ends, t - t % block + block)
             acting = np.stack([plan.acting for plan in plans])
             buffers.valid[:, t:until] = acting[:, None]
-            self._act(params, noise[t % block :], t, until, acting, final_values)
+            self._act(params, noise, t, until, acting, final_values)
             t = until
             for member in members:
                 if plans[member].last == t:
@@ -173,7 +181,8 @@ class HostCollector:
                 np.zeros((size, *buffer.shape[2:]), buffer.dtype)
                 for buffer in (self._buffers.observation, self._buffers.action)
             )
-            scores = np.asarray(self._program.score(params, observation, action))
+            memory = self._memory.of_segment(0, slice(0, size))
+            scores = np.asarray(self._program.score(params, observation, action, *memory))
             steps = ScoredStep(observation, action, *(scores[..., i] for i in range(3)))
             none = np.int32(0)
             self._program.decide(filters[0], steps, none, none, key, hypers)
@@ -186,10 +195,11 @@ class HostCollector:
         if self._config.dropped == "mask" or self._program.filter is None:
             wanted = np.minimum(wanted, steps - t)
         acting = wanted > 0
+        self._memory.begin_segment(member)
         return _Segment(t, t + int(wanted[acting].min()) if acting.any() else 0, acting)
 
     def _draw(self, iteration: int, block: int) -> np.ndarray:
-        """Action noise of T steps `[T, P, N, M]`."""
+        """Action noise of T steps `[T / hold, P, N, M]`."""
         return np.stack(
             [
                 np.asarray(self._program.draw(keys.action, np.int32(iteration), np.int32(block)))
@@ -207,15 +217,21 @@ class HostCollector:
         acting: np.ndarray,
         final_values: dict[tuple[int, int, int], float],
     ) -> None:
-        """Acts everywhere for rows `first` to `last` of the buffers."""
+        """Acts everywhere for rows `first` to `last` of the buffers; `noise` is of their block."""
+        policy, block = self._program.policy, self._config.rollout_steps
         actor, moments, seen = self._actor, self.observation_moments, self.state.observation
         shape, active, width = self._shape, acting.reshape(-1), self._spaces.action_width
         observations = self._observed
+        self._memory.acting = acting
         actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
-            actions[row] = action = actor.act(observations[row], noise[row - first])
+            if self._envs.waiting is not None:
+                self._memory.acting = acting & ~self._waiting()
+            own = noise[row % block // policy.hold]
+            actions[row] = action = actor.act(observations[row], own)
             self._note_idle(row, acting)
-            step = self._envs.step(action.reshape(-1, width), active)
+            shown = to_env(policy.distribution, action)
+            step = self._envs.step(shown.reshape(-1, width), active)
             rewards[row] = step.reward.reshape(shape)
             seen = step.observation.reshape(seen.shape)
             if moments is None:
@@ -278,6 +294,7 @@ class HostCollector:
             for member, env in np.argwhere(truncated).tolist():
                 value = self._values(params, final, member)[env]
                 final_values[member, row, env] = float(value)
+        self._memory.forget(self._over[:, row])
 
     def _values(self, params: np.ndarray, raw: np.ndarray, member: int) -> np.ndarray:
         """V of a member's N raw observations, `raw` being `[P, N, *obs]`."""
@@ -286,14 +303,18 @@ class HostCollector:
             moments = self.observation_moments.of(member)
             observation = normalize(moments, observation, self._config.clip_observations)
         observation = observation.astype(self._spaces.observation_dtype)
-        return np.asarray(self._program.value(params[member], observation))
+        state = self._memory.now(member)
+        return np.asarray(self._program.value(params[member], observation, *state))
 
     def _score(self, params: np.ndarray, member: int, first: int, last: int) -> None:
         """Writes log-probability, value and Vex for the rows of a member's segment."""
         buffers, rows = self._buffers, slice(first, last)
         observation = self._padded(buffers.observation[member, rows])
         action = self._padded(buffers.action[member, rows])
-        scores = np.asarray(self._program.score(params, observation, action))[: last - first]
+        memory = self._memory.of_segment(member, rows)
+        memory[:1] = map(self._padded, memory[:1])
+        found = self._program.score(params, observation, action, *memory)
+        scores = np.asarray(found)[: last - first]
         for i, name in enumerate(("log_prob", "value", "vex")):
             getattr(buffers, name)[member, rows] = scores[..., i]
 
@@ -359,7 +380,7 @@ class HostCollector:
 
     def _collected(self, member: int) -> Collected:
         episodes = self._finish(member)
-        rollout = Rollout(*(buffer[member] for buffer in self._buffers))
+        rollout = jax.tree.map(lambda buffer: buffer[member], self._buffers)
         returns = [episode.return_ for episode in episodes]
         lengths = [episode.length for episode in episodes]
         return Collected(
@@ -423,11 +444,3 @@ def running_sum(start: float, values: np.ndarray) -> float:
     for value in values.tolist():
         total += value
     return total
-
-
-def chunk_sizes(rollout_steps: int) -> list[int]:
-    """Lengths that segments are padded to, rising: T, and T over powers of 4 down to 32."""
-    sizes = [rollout_steps]
-    while sizes[0] >= 128:
-        sizes.insert(0, -(-sizes[0] // 4))
-    return sizes

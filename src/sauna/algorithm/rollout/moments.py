@@ -16,7 +16,9 @@ from sauna.system.compiled import compiled
 
 
 class ObservationMoments:
-    """Moments of P members' observations `[P, N, D]`, updated in place.
+    """Moments of the first D numbers of P members' observations `[P, N, >= D]`.
+
+    They are updated in place.
 
     Attributes:
       mean, variance: `[P, D]` float64; count: `[P, 1]`.
@@ -50,7 +52,7 @@ class ObservationMoments:
 @compiled
 def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) -> None:
     """`policy.normalize.update_moments`, in place."""
-    members, envs, size = observation.shape
+    members, envs, size = observation.shape[0], observation.shape[1], mean.shape[1]
     for p in range(members):
         number = acting[p].sum()
         if number == 0:
@@ -78,13 +80,15 @@ def _see(observation: Any, acting: Any, mean: Any, variance: Any, count: Any) ->
 def _normalize(
     observation: Any, mean: Any, variance: Any, epsilon: float, clip: float, out: Any
 ) -> None:
-    """`policy.normalize.normalize`, written to `out`."""
-    members, envs, size = observation.shape
+    """`policy.normalize.normalize`, written to `out`; what has no moments stays as it is."""
+    members, envs, size = observation.shape[0], observation.shape[1], mean.shape[1]
     for p in range(members):
         for n in range(envs):
             for d in range(size):
                 scaled = (observation[p, n, d] - mean[p, d]) / np.sqrt(variance[p, d] + epsilon)
                 out[p, n, d] = min(max(scaled, -clip), clip)
+            for d in range(size, observation.shape[2]):
+                out[p, n, d] = observation[p, n, d]
 
 
 @compiled

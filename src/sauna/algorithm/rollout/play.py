@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout import MAX_STEPS
@@ -37,19 +38,23 @@ def play(
     seed: int,
     watch: Callable[[], None] = lambda: None,
     max_steps: int = MAX_STEPS,
+    hold: int = 1,
 ) -> Episode:
     """Plays one episode, cut after `max_steps` env steps.
 
     Args:
-      policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes.
+      policy: `policy(observation, deterministic=..., key=...)` gives what the environment takes;
+        its `reset()` is called first, if it has one.
       watch: called after the reset and after each env step.
+      hold: env steps for which sampled actions have one key; see `Policy.hold`.
     """
     key = jax.random.key(seed)
+    getattr(policy, "reset", lambda: None)()
     observation = reset_with(env, seed)
     watch()
     return_, length, ended, info = 0.0, 0, False, None
     while not ended and length < max_steps:
-        step_key = None if deterministic else _fold_in(key, length)
+        step_key = None if deterministic else _fold_in(key, length // hold)
         action = policy(observation, deterministic=deterministic, key=step_key)
         observation, reward, terminated, truncated, info = env.step(action)
         return_, length = return_ + one_number(reward), length + 1
@@ -82,6 +87,7 @@ class _Now(NamedTuple):
     length: Array
     ended: Array
     success: Array
+    memory: Any  # [E, H] of a recurrent policy, else ()
 
 
 def play_on_device(
@@ -103,19 +109,20 @@ def play_on_device(
     """
     distribution = policy.distribution
 
-    def act(now: _Now) -> Array:
+    def act(now: _Now) -> tuple[Array, Any]:
         seen = now.observation
         if moments is not None:
             seen = normalize(moments, seen, config.clip_observations)
-        parameters = policy.apply(params, seen).policy
+        output, memory = policy.step(params, seen, now.memory)
         if deterministic:
-            return distribution.mode(parameters)
-        own = jax.vmap(jax.random.fold_in, (0, None))(keys, now.t)
+            return to_env(distribution, distribution.mode(output.policy)), memory
+        own = jax.vmap(jax.random.fold_in, (0, None))(keys, now.t // policy.hold)
         noise = jax.vmap(lambda key: distribution.draw(key, ()))(own)
-        return distribution.sample(parameters, noise)
+        return to_env(distribution, policy.sample(params, output, noise)), memory
 
     def step(now: _Now) -> _Now:
-        transition = jax.vmap(env.step)(now.state, act(now))
+        action, memory = act(now)
+        transition = jax.vmap(env.step)(now.state, action)
         running = ~now.ended
         success = dict(transition.info).get(IS_SUCCESS, jnp.nan)
         return _Now(
@@ -126,6 +133,7 @@ def play_on_device(
             now.length + running,
             now.ended | transition.terminated | transition.truncated,
             jnp.where(running, success, now.success),
+            memory,
         )
 
     state, observation = jax.vmap(lambda key: env.reset(jax.random.fold_in(key, _RESET)))(keys)
@@ -138,6 +146,7 @@ def play_on_device(
         zeros.astype(jnp.int32),
         zeros.astype(bool),
         zeros + jnp.nan,
+        policy.initial_state(len(keys)),
     )
     last = jax.lax.while_loop(lambda now: (now.t < max_steps) & ~jnp.all(now.ended), step, first)
     success = jnp.where(last.ended, last.success, jnp.nan)

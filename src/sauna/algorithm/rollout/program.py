@@ -9,7 +9,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.policy.policy import Policy, act, make_policy, score
+from sauna.algorithm.policy.policy import (
+    Policy,
+    act,
+    act_with_state,
+    make_policy,
+    score,
+    score_with_state,
+)
 from sauna.algorithm.selection.registry import make_filter
 from sauna.algorithm.types import Array, Hypers, ScoredStep, StepFilter
 from sauna.config.settings import Config
@@ -22,15 +29,18 @@ class Program(NamedTuple):
     `act` takes a leading member axis `P` on every argument; the others take one member. On CPU a
     member's numbers must not depend on its neighbours, so members are never batched into one
     matrix product: `act` maps over them.
+
+    Of a recurrent policy, `act` also takes and gives states, `score` takes what `score_with_state`
+    does, and `value` takes states.
     """
 
     config: Config
     policy: Policy
     filter: StepFilter | None
     draw: Callable[[Array, Any, Any], Array]
-    act: Callable[[Array, Any, Any], Array]
-    score: Callable[[Any, Any, Any], Array]
-    value: Callable[[Any, Any], Array]
+    act: Callable[..., Any]
+    score: Callable[..., Array]
+    value: Callable[..., Array]
     decide: Callable[..., tuple[Any, Array]]
 
 
@@ -47,24 +57,30 @@ def make_program(config: Config, spaces: Spaces) -> Program:
     """Builds (without compiling) what members with this static config collect by."""
     policy = make_policy(config, spaces)
     filter = make_filter(config)
+    recurrent = policy.state_size > 0
+    acting, scoring = (act_with_state, score_with_state) if recurrent else (act, score)
     return Program(
         config=config,
         policy=policy,
         filter=filter,
         draw=jax.jit(partial(draw_noise, policy, config)),
-        act=jax.jit(map_members(partial(act, policy))),
-        score=jax.jit(partial(score, policy)),
-        value=jax.jit(lambda params, observation: policy.apply(params, observation).value),
+        act=jax.jit(map_members(partial(acting, policy))),
+        score=jax.jit(partial(scoring, policy)),
+        value=jax.jit(partial(_value, policy)),
         decide=jax.jit(partial(decide, filter)) if filter else _nothing_to_decide,
     )
+
+
+def _value(policy: Policy, params: Array, observation: Array, state: Any = ()) -> Array:
+    return policy.step(params, observation, state)[0].value
 
 
 def draw_noise(
     policy: Policy, config: Config, root: Array, iteration: Array, block: Array
 ) -> Array:
-    """Action noise `[T, N, M]` of the rollout's rows from `block * T` on."""
+    """Action noise `[T / hold, N, M]`, rounded up, of the rollout's rows from `block * T` on."""
     key = jax.random.fold_in(jax.random.fold_in(root, iteration), block)
-    return policy.distribution.draw(key, (config.rollout_steps, config.envs))
+    return policy.distribution.draw(key, (-(-config.rollout_steps // policy.hold), config.envs))
 
 
 def _nothing_to_decide(*arguments: Any) -> tuple[Any, Array]:

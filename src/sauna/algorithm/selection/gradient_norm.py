@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from sauna.algorithm.policy.bounded import beta
 from sauna.algorithm.selection.scores import check_range, check_share
 from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
@@ -16,9 +17,11 @@ def gradient_norm(setup: SamplerSetup, uniform: float = 0.1, share: float = 1.0)
     With `z = (a - mu) / sigma` and h the last hidden layer:
 
         Gaussian     g = |A^| sqrt(sum_j (z_j/sigma_j)^2 (|h|^2 + 1) + sum_j (z_j^2 - 1)^2)
+        Beta         g = |A^| sqrt(sum_k (d log pi / d output_k)^2) sqrt(|h|^2 + 1)
         categorical  g = |A^| sqrt(sum_c (1 - 2 pi_a + sum_i pi_i^2)) sqrt(|h|^2 + 1)
 
-    summed over the components c of a factored action. The value loss draws rows of its own, by
+    the first also under a tanh, whose slope no parameter moves, the last summed over the components
+    c of a factored action. The value loss draws rows of its own, by
     `|R - V|`. After Katharopoulos & Fleuret 2018.
     """
 
@@ -60,6 +63,10 @@ def head_gradient(setup: SamplerSetup, policy: Array, action: Array, hidden: Arr
       policy: `[M, K]` parameters of the distribution; action: `[M, A]`; hidden: `[M, H]`.
     """
     above = jnp.sum(hidden**2, -1) + 1.0
+    if setup.action_kind == "continuous" and setup.distribution == "beta":
+        log_prob = beta(setup.action_sizes[0]).log_prob
+        outputs = jax.grad(lambda outputs: jnp.sum(log_prob(outputs, action)))(policy)
+        return jnp.sqrt(jnp.sum(outputs**2, -1) * above)
     if setup.action_kind == "continuous":
         mean, log_std = jnp.split(policy, 2, -1)
         z = (action - mean) * jnp.exp(-log_std)

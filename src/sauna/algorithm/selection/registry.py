@@ -85,6 +85,7 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
         action_kind,
         action_sizes,
         config.replay_rollouts,
+        config.distribution,
     )
     sampler = _made("sampler", config.sampler, SAMPLERS, Sampler, config.sampler_kwargs, setup)
     weight = _made(
@@ -97,6 +98,12 @@ def make_rules(config: Config, action_kind: str, action_sizes: tuple[int, ...]) 
             )
         sampler = sampler and controlled(config.control, sampler)
         weight = weight and controlled_weight(config.control, weight)
+    beta = action_kind == "continuous" and config.distribution == "beta"
+    if weight is not None and weight.on_mean and beta:
+        raise BadInput(
+            "loss_weight: its on_mean needs a parameter of the mean, which distribution beta has "
+            "none of"
+        )
     return Rules(
         sampler=sampler,
         loss_weight=weight,

@@ -29,6 +29,12 @@ class HostFace(gymnasium.Env):
         self.metadata = {**HostFace.metadata, "render_fps": env.frames_per_second}
         self._reset, self._step = jax.jit(env.reset), jax.jit(self._compiled_step)
         self._state: Any = None
+        self.action_masks = None if env.action_mask is None else self._mask
+
+    def _mask(self) -> np.ndarray:
+        """Which actions are valid now."""
+        assert self._env.action_mask is not None
+        return np.asarray(self._env.action_mask(self._state))
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Without a seed, the episode is drawn from the generator that the last seed began."""

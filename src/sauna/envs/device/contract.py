@@ -59,6 +59,8 @@ class JaxEnv(NamedTuple):
       observation_space, action_space: Gymnasium spaces.
       render: `state -> image [H, W, 3] uint8` on the host, where there is one.
       frames_per_second: of `render`'s pictures, one per env step.
+      action_mask: `state -> mask`, 1 or True for each choice of a Discrete or MultiDiscrete action
+        (one component after the other) that is valid there; at least one of each component.
     """
 
     reset: Callable[[Array], tuple[State, Array]]
@@ -67,6 +69,7 @@ class JaxEnv(NamedTuple):
     action_space: Any
     render: Callable[[State], Any] | None = None
     frames_per_second: float = 30.0
+    action_mask: Callable[[State], Array] | None = None
 
 
 def ended_where_broken(transition: Transition) -> Transition:
@@ -93,19 +96,25 @@ class Running(NamedTuple):
     first: Any  # (state, observation) that `reset="cached"` returns to, else ()
 
 
-def flat(env: JaxEnv, rescale: bool = False) -> JaxEnv:
+def flat(env: JaxEnv, rescale: bool = False, masked: bool = False) -> JaxEnv:
     """`env` with the arrays that the learner has: observations `[*Spaces.observation_shape]`,
-    actions `[A]`, which are clipped (or stretched: `rescale`) here and nowhere else."""
-    read, write = _reader(env.observation_space), _writer(env.action_space, rescale)
+    actions `[A]`, which are clipped (or stretched: `rescale`) here and nowhere else.
+
+    Args:
+      masked: the mask is a part of the observation.
+    """
+    write = _writer(env.action_space, rescale)
+    read = _masked_reader(env) if masked else _without_mask(_reader(env.observation_space))
 
     def reset(key: Array) -> tuple[State, Array]:
         state, observation = env.reset(key)
-        return state, read(observation)
+        return state, read(state, observation, False)
 
     def step(state: State, action: Array) -> Transition:
         transition = env.step(state, write(action))
+        ended = transition.terminated | transition.truncated
         return transition._replace(
-            observation=read(transition.observation),
+            observation=read(transition.state, transition.observation, ended),
             reward=jnp.asarray(transition.reward, jnp.float32),
             truncated=transition.truncated & ~transition.terminated,
             info=numbers_in(transition.info),
@@ -114,16 +123,73 @@ def flat(env: JaxEnv, rescale: bool = False) -> JaxEnv:
     return env._replace(reset=reset, step=step)
 
 
+def _without_mask(read: Callable[[Any], Array]) -> Callable[[State, Any, Any], Array]:
+    return lambda state, observation, ended: read(observation)
+
+
+def _masked_reader(env: JaxEnv) -> Callable[[State, Any, Any], Array]:
+    """Of the observation and the mask, side by side.
+
+    Where an episode ends every action counts as valid. A mask that leaves a component no valid
+    action becomes NaN, which is reported.
+    """
+    from sauna.envs.masked import choices
+
+    packed, mask_of = _packed_reader(env.observation_space), env.action_mask
+    sizes = choices(env.action_space)
+    splits = np.cumsum(sizes)[:-1]
+    assert mask_of is not None
+
+    def read(state: State, observation: Any, ended: Any) -> Array:
+        mask = (jnp.asarray(mask_of(state)).reshape(-1) != 0) | jnp.asarray(ended)
+        if mask.shape != (sum(sizes),):
+            raise ValueError(f"its action mask has {mask.size} entries instead of {sum(sizes)}")
+        has_valid = jnp.stack([part.any() for part in jnp.split(mask, splits)]).all()
+        numbers, pictures = packed(observation)
+        return jnp.concatenate([numbers, jnp.where(has_valid, mask, jnp.nan), pictures])
+
+    return read
+
+
+def _packed_reader(space: Any) -> Callable[[Any], tuple[Array, Array]]:
+    """Of an observation of several parts: its numbers, and its pictures' bytes as numbers."""
+    from sauna.envs.pictures import is_picture
+    from sauna.envs.shapes import leaves, part_at
+    from sauna.envs.spaces import describe_observation
+
+    parts = list(leaves(space))
+    whole = describe_observation(space)[0] == "image"
+    readers = [
+        (path, whole or is_picture(part), _reader(part) if whole else _part_reader(part))
+        for path, part in parts
+    ]
+    empty = jnp.zeros(0, jnp.float32)
+
+    def read(observation: Any) -> tuple[Array, Array]:
+        found: tuple[list[Array], list[Array]] = ([empty], [empty])
+        for path, as_picture, reader in readers:
+            part = reader(part_at(observation, path))
+            found[as_picture].append(jnp.asarray(part, jnp.float32).reshape(-1))
+        return jnp.concatenate(found[0]), jnp.concatenate(found[1])
+
+    return read
+
+
 def _reader(space: Any) -> Callable[[Any], Array]:
     """The device's twin of `spaces.observation_reader`."""
     from gymnasium import spaces as gym
 
+    from sauna.envs.pictures import is_picture
+    from sauna.envs.shapes import leaves
     from sauna.envs.spaces import PICTURES, describe_observation
 
     if isinstance(space, gym.Discrete):
         return lambda x: jax.nn.one_hot(x - space.start, int(space.n))
     if isinstance(space, gym.MultiDiscrete):
         return _reader_of_choices(space)
+    if any(path and is_picture(part) for path, part in leaves(space)):
+        packed = _packed_reader(space)
+        return lambda x: jnp.concatenate(packed(x))
     if isinstance(space, gym.Dict | gym.Tuple):
         parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
         readers = {name: _part_reader(part) for name, part in parts}
@@ -137,10 +203,12 @@ def _reader(space: Any) -> Callable[[Any], Array]:
 
 
 def _part_reader(space: Any) -> Callable[[Any], Array]:
-    """Of a part of a Dict or Tuple, where also bytes become numbers of a vector."""
+    """Of a part of a Dict or Tuple, where also small boards become numbers of a vector."""
     from gymnasium import spaces as gym
 
-    if isinstance(space, gym.Box | gym.MultiBinary):
+    from sauna.envs.pictures import is_picture
+
+    if isinstance(space, gym.Box | gym.MultiBinary) and not is_picture(space):
         return lambda x: jnp.asarray(x, jnp.float32).reshape(-1)
     return _reader(space)
 

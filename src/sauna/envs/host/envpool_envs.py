@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from sauna.system.errors import BadInput, nearest
+
+OF_THE_POOL = ("env_id", "elapsed_step", "players")
 
 
 def make_envpool(name: str) -> Callable[..., Any]:
@@ -44,7 +47,11 @@ class EnvPool:
     def _made(self, seed: int) -> Any:
         import envpool
 
-        return envpool.make_gymnasium(self._name, num_envs=self.num_envs, seed=seed, **self._kwargs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on the precision of its boxes
+            return envpool.make_gymnasium(
+                self._name, num_envs=self.num_envs, seed=seed, **self._kwargs
+            )
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         """Begins new episodes in all rows."""
@@ -54,8 +61,9 @@ class EnvPool:
         return self._pool.reset()
 
     def step(self, action: Any) -> Any:
-        """One step of all rows."""
-        return self._pool.step(action)
+        """One step of all rows; what its info says of the pool itself is left out."""
+        *answer, info = self._pool.step(action)
+        return *answer, {name: value for name, value in info.items() if name not in OF_THE_POOL}
 
     def close(self) -> None:
         """Frees the pool's threads."""

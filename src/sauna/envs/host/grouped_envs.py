@@ -57,6 +57,10 @@ class GroupedEnvs(HostEnvs):
         self.spaces = describe(observation_space, action_space)
         self._read = observation_reader(observation_space)
         self._write = action_writer(action_space, rescale)
+        self._is_plain = self.spaces.observation_structure == (
+            "Box",
+            *self.spaces.observation_shape,
+        )
         number = groups[-1].rows.stop
         shape = (number, *self.spaces.observation_shape)
         dtype = np.uint8 if self.spaces.observation_kind == "image" else np.float64
@@ -103,6 +107,16 @@ class GroupedEnvs(HostEnvs):
         if not (np.abs(read) <= LARGEST).all():
             raise ValueError(f"the observation of row {row} is not finite, or too large")
         rows[row] = read
+
+    def _put_all(self, rows: np.ndarray, group: Group, batch: Any) -> bool:
+        """Writes the plain vectors of all rows of a group at once; False for other observations."""
+        if not self._is_plain:
+            return False
+        read = np.asarray(batch)
+        if read.shape != rows[group.rows].shape or not (np.abs(read) <= LARGEST).all():
+            return False  # row by row it is found which
+        rows[group.rows] = read
+        return True
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
         self._terminated[:], self._truncated[:], self._reward[:] = False, False, 0.0

@@ -67,8 +67,10 @@ def _make_vec(name: str) -> Make:
         spec = gymnasium.spec(name)
         mode = kwargs.get("vectorization_mode")
         if mode not in (None, "vector_entry_point") or spec.vector_entry_point is None:
-            own = kwargs.get("vector_kwargs") or {}
-            kwargs["vector_kwargs"] = {"autoreset_mode": "SameStep", **own}
+            ours = {"autoreset_mode": "SameStep"}
+            if mode == "async":
+                ours["context"] = "spawn"  # to fork beside JAX's threads may hang
+            kwargs["vector_kwargs"] = {**ours, **(kwargs.get("vector_kwargs") or {})}
         return gymnasium.make_vec(name, num_envs=num_envs, **kwargs)
 
     return make

@@ -82,6 +82,8 @@ class VectorEnvs(GroupedEnvs):
         """Writes a batch of observations to a group's rows, or to those of `only` `[N]`."""
         from gymnasium.vector.utils import iterate
 
+        if only is None and self._put_all(rows, group, batch):
+            return
         for n, observation in enumerate(iterate(group.env.observation_space, batch)):
             if only is None or only[n]:
                 self._put(rows, group.rows.start + n, observation)

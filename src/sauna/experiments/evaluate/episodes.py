@@ -14,6 +14,7 @@ from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env, one_name
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.play import Progress
 from sauna.experiments.evaluate.video import check_drawn, record_video
@@ -111,7 +112,7 @@ def evaluate(
         result["env_kwargs"] = kwargs
     if video:
         check_drawn(result["env"], kwargs)
-    made = make_env(result["env"], kwargs)
+    made = make_env(result["env"], kwargs, wrapping_of(artifact.config))
     check_spaces(artifact, made)
     from sauna.algorithm.rollout.play import play, success_rate  # imports JAX: after the checks
     from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -119,8 +120,9 @@ def evaluate(
     for name in chosen:
         policy = TrainedPolicy(artifact, name, made, best)
         progress = Progress(name, episodes, say)
+        watch, hold = progress.step, policy.policy.hold
         played = [
-            progress.played(play(policy, made, deterministic, seed + i, progress.step, max_steps))
+            progress.played(play(policy, made, deterministic, seed + i, watch, max_steps, hold))
             for i in range(episodes)
         ]
         result["members"][name] = statistics(played) | success_rate(played)

@@ -15,6 +15,7 @@ import numpy as np
 
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_drawn_env, make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.safe_write import own_folder, replacing
 from sauna.training.artifact import Artifact
@@ -75,11 +76,12 @@ def record_video(
     own_folder(path.parent)
     try:
         with replacing(path) as part:
-            drawn = make_drawn_env(env, env_kwargs)
+            drawn = make_drawn_env(env, env_kwargs, wrapping_of(artifact.config))
             try:
                 policy = TrainedPolicy(artifact, member, drawn, best)
                 with video(part, frames_per_second(drawn)) as add:
-                    play(policy, drawn, deterministic, seed, lambda: add(drawn.render()), max_steps)
+                    watch, hold = lambda: add(drawn.render()), policy.policy.hold
+                    play(policy, drawn, deterministic, seed, watch, max_steps, hold)
             finally:
                 close(drawn)
     except SaunaError:

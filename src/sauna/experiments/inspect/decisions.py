@@ -162,7 +162,7 @@ def advantages(config: Config, stream: Rollout, rollouts: list[int], hypers: Hyp
     """
     found = np.full(len(stream.reward), np.nan)
     for first, last in zip(rollouts, [*rollouts[1:], len(found)], strict=True):
-        rollout = Rollout(*(jnp.asarray(x[first:last]) for x in stream))
+        rollout: Rollout = jax.tree.map(lambda x: jnp.asarray(x[first:last]), stream)  # noqa: B023
         if config.gae_over == "all":
             over_all = advantages_over_all(rollout, hypers, config.truncation == "bootstrap")
             found[first:last] = np.asarray(over_all)[:, 0]

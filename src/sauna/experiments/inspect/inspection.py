@@ -16,6 +16,7 @@ from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState, membe
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.envs.host.parallel_envs import AgentsAsOne
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import frames_per_second
@@ -79,7 +80,8 @@ def examine(
     if member is None:
         raise BadCheckpoint(f"{artifact.checkpoint.path}: its config has no member {name!r}")
     config, iteration = member.config, int(manifest["iteration"])
-    env, drawer = open_env(config.env, json.loads(config.env_kwargs), frames, say)
+    kwargs, around = json.loads(config.env_kwargs), wrapping_of(config)
+    env, drawer = open_env(config.env, kwargs, around, frames, say)
     if isinstance(env, AgentsAsOne):
         raise BadInput("inspect: a page shows one agent; an environment of several cannot be shown")
     policy = TrainedPolicy(artifact, name, env)
@@ -102,7 +104,7 @@ def examine(
         found = until(learned(*parts, hypers, member.seed, iteration), steps)
     end = len(decisions.keep)
     kept: Any = decisions.keep[:, None]
-    alone = Rollout(*(x[:end, :1] for x in streams))._replace(keep=kept)
+    alone: Rollout = jax.tree.map(lambda x: x[:end, :1], streams)._replace(keep=kept)
     points, shares = principal_components(played.observation)
     return Inspection(
         member=member,

@@ -18,6 +18,8 @@ from sauna.algorithm.learner.losses import loss_terms
 from sauna.algorithm.learner.program import Learner, make_learner, make_parts
 from sauna.algorithm.learner.samples import advantages_over_all, kept_rows, with_matched_control
 from sauna.algorithm.learner.selected import drawn_length, first_draw
+from sauna.algorithm.learner.sequence_choice import choice_of_sequences, rows_of_sequences
+from sauna.algorithm.learner.sequences import row_outputs, units
 from sauna.algorithm.learner.update import (
     Parts,
     device_minibatch_order,
@@ -29,6 +31,7 @@ from sauna.algorithm.types import (
     Array,
     Batch,
     Hypers,
+    Memory,
     Rollout,
     TrainState,
     member_keys,
@@ -81,9 +84,10 @@ def learned(
     found: dict[str, np.ndarray] = {}
     for i, span in enumerate(spans, iteration):
         key, order, every = draws_of(parts, seed, i)
-        rollout = controlled_rollout(rollout_of(streams, span), hypers, key, config)
+        rollout = rollout_of(streams, span, config.sequence_length)
+        rollout = controlled_rollout(rollout, hypers, key, config)
         batch = learner.make_batch(rollout, hypers, key)
-        after, columns = asked(state, batch, order, key)
+        after, columns = asked(state, batch, rollout, order, key)
         if config.loss_weight != "none":
             draws = key, order, every
             columns |= _weights(learner, weighed, state, rollout, batch, hypers, draws)
@@ -103,20 +107,28 @@ def learned(
 def draws_of(parts: Parts, seed: int, iteration: int) -> tuple[Array, Any, Any]:
     """The key of an iteration's draws, the order of each epoch, and one of all rows `[M]`."""
     config, keys = parts.config, member_keys(seed)
-    key = selection_key(keys, iteration)
+    key, rows = selection_key(keys, iteration), config.rollout_steps * config.envs
+    every: Any = np.arange(rows)  # of a recurrent policy, whose orders are of sequences
     if config.backend == "device":
         own = jax.random.fold_in(keys.order, iteration)
-        few = device_minibatch_order(config, own, drawn_length(parts))
-        return key, few, device_minibatch_order(config, own)[0]
-    order = minibatch_order(config, seed, iteration)
-    return key, order, order[0]
+        order: Any = device_minibatch_order(config, own, drawn_length(parts))
+        if config.recurrent == "none":
+            every = device_minibatch_order(config, own)[0]
+    else:
+        order = minibatch_order(config, seed, iteration)
+        if config.recurrent == "none":
+            every = order[0]
+    return key, order, every
 
 
-def rollout_of(streams: Rollout, span: Span) -> Rollout:
-    """One rollout `[S, N, ...]` of streams `[L, N, ...]`."""
+def rollout_of(streams: Rollout, span: Span, length: int) -> Rollout:
+    """One rollout `[S, N, ...]` of streams `[L, N, ...]`; `length` is a recurrent policy's."""
     rows = span.first + np.arange(len(span.valid))[:, None]
-    columns: dict[str, Any] = {n: rows_of(x, rows) for n, x in streams._asdict().items()}
-    return Rollout(**{**columns, "valid": span.valid, "keep": span.keep})
+    found: Rollout = jax.tree.map(lambda x: rows_of(x, rows), streams)
+    if found.memory is not None:
+        start, state = found.memory
+        found = found._replace(memory=Memory(start, state[::length]))
+    return found._replace(valid=span.valid, keep=span.keep)  # type: ignore[arg-type]
 
 
 def controlled_rollout(rollout: Rollout, hypers: Hypers, key: Array, config: Config) -> Rollout:
@@ -126,18 +138,23 @@ def controlled_rollout(rollout: Rollout, hypers: Hypers, key: Array, config: Con
 
 
 def ask(
-    state: TrainState, batch: Batch, order: Array, key: Array, *, parts: Parts
+    state: TrainState, batch: Batch, rollout: Rollout, order: Array, key: Array, *, parts: Parts
 ) -> tuple[TrainState, dict[str, Array]]:
     """What the sampler takes of `M` rows in the first epoch, as columns `[M]` of `Learned`."""
     config, present = parts.config, batch.weight > 0
-    state, choice, drawn = first_draw(state, batch, order, key, parts=parts)
+    state, choice, drawn = first_draw(state, batch, rollout, order, key, parts=parts)
     taken, columns = present, {}
     if choice.keep is not None:
         taken = present & choice.keep
     else:
-        counts = jnp.arange(len(drawn.rows)) < drawn.number
-        taken = jnp.zeros_like(present).at[drawn.rows].max(counts)
-        columns["draws"] = drawn_length(parts) * choice.probability
+        counts, probability = jnp.arange(len(drawn.rows)) < drawn.number, choice.probability
+        taken = jnp.zeros(units(config), bool).at[drawn.rows].max(counts)
+        if rollout.memory is not None:
+            of = batch, rollout, config.sequence_length
+            taken = rows_of_sequences(taken, *of) & present
+            probability = choice_of_sequences(choice, *of).probability
+            probability = rows_of_sequences(probability, *of) * present
+        columns["draws"] = drawn_length(parts, draws=True) * probability
     if config.advantage_sign == "positive":
         taken &= loss_advantage(batch.advantage, batch.weight, config) > 0
     if parts.rules.sampler is not None:
@@ -150,6 +167,7 @@ def weigh(
     params: Array,
     state: TrainState,
     batch: Batch,
+    rollout: Rollout,
     draws: tuple[Array, Any, Any],
     *,
     parts: Parts,
@@ -163,7 +181,7 @@ def weigh(
     config, distribution = parts.config, parts.policy.distribution
     assert parts.rules.loss_weight is not None
     key, order, every = draws
-    _, choice, _ = first_draw(state, batch, order, key, parts=parts)
+    _, choice, _ = first_draw(state, batch, rollout, order, key, parts=parts)
     present = batch.weight if choice.keep is None else batch.weight * choice.keep
     over = batch.weight if config.normalize_over == "rollout" else present
     rows = jax.tree.map(lambda x: x[every], batch)
@@ -171,7 +189,8 @@ def weigh(
         advantage=loss_advantage(batch.advantage, over, config)[every],
         weight=present[every],
     )
-    output = parts.policy.apply(params, rows.observation)
+    output = row_outputs(parts.policy, params, batch, rollout, config.sequence_length)
+    output = jax.tree.map(lambda x: x[every], output)
     log_prob = distribution.log_prob(output.policy, rows.action)
     entropy = distribution.entropy(output.policy)
     terms = loss_terms(rows, rows.advantage, rows.weight, log_prob, entropy, distribution)
@@ -192,8 +211,8 @@ def _weights(
     """The loss weight before and after the update of a rollout, as columns `[M]` of `Learned`."""
     own, (key, order, _) = jax.tree.map(jnp.copy, state), draws
     updated, _ = learner.learn(own, rollout, batch, hypers, order, key)  # takes over own's memory
-    mask, scale = weighed(state.params, state, batch, draws)
-    last_mask, last_scale = weighed(updated.params, state, batch, draws)
+    mask, scale = weighed(state.params, state, batch, rollout, draws)
+    last_mask, last_scale = weighed(updated.params, state, batch, rollout, draws)
     return {
         "first_weight": mask * scale,
         "last_weight": last_mask * last_scale,

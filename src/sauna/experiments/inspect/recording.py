@@ -13,6 +13,7 @@ from sauna.algorithm.rollout.play import play
 from sauna.envs.host.answers import life_lost, one_number
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.make import make_drawn_env, make_env
+from sauna.envs.wrapping import Wrapping
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.play import Progress
 from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -28,7 +29,7 @@ class Played(NamedTuple):
     """`L` env steps, episode after episode; the last one may have been left before its end."""
 
     observation: np.ndarray  # [L, *obs] what the network got
-    action: np.ndarray  # [L, A] what the network chose, neither clipped nor stretched
+    action: np.ndarray  # [L, A] what the network chose, as a rollout holds it
     reward: np.ndarray  # [L] float64, raw
     terminated: np.ndarray  # [L] bool
     truncated: np.ndarray  # [L] bool, never together with terminated
@@ -114,6 +115,7 @@ class Recorder:
 
     def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
         observation, info = self._env.reset(seed=seed)
+        self._policy.reset()
         self._steps = 0
         self._now = self._see(observation)
         return observation, info
@@ -133,7 +135,11 @@ class Recorder:
 
 
 def open_env(
-    env: str, kwargs: dict[str, Any], frames: bool, say: Callable[[str], None]
+    env: str,
+    kwargs: dict[str, Any],
+    wrapping: Wrapping,
+    frames: bool,
+    say: Callable[[str], None],
 ) -> tuple[Any, Frames | None]:
     """Returns the environment, and what draws it; where it cannot be drawn, one line says so.
 
@@ -144,13 +150,13 @@ def open_env(
         chosen = dict(os.environ)
         choose_renderer()
         try:
-            env = make_drawn_env(env, kwargs)
+            env = make_drawn_env(env, kwargs, wrapping)
             return env, Frames(env, say)
         except BadInput as error:
             os.environ.clear()
             os.environ.update(chosen)  # a renderer that fails may also fail the plain environment
             say(f"no frames: {not_drawn(error)}")
-    return make_env(env, kwargs), None
+    return make_env(env, kwargs, wrapping), None
 
 
 def play_episodes(
@@ -167,7 +173,8 @@ def play_episodes(
     recorder = Recorder(env, policy, frames, max_steps)
     progress, returns = Progress(policy.name, episodes, say), []
     for i in range(episodes):
-        episode = play(recorder.act, recorder, deterministic, seed + i, progress.step, max_steps)
+        watch, hold = progress.step, policy.policy.hold
+        episode = play(recorder.act, recorder, deterministic, seed + i, watch, max_steps, hold)
         returns.append(progress.played(episode).return_)
     progress.say_cut(max_steps)
     return _played(recorder, returns, frames)
@@ -187,7 +194,8 @@ def play_steps(
     recorder, episode = Recorder(env, policy, None, max_steps), first
     while (left := steps - len(recorder.transitions)) > 0:
         own_seed = episode_seed(seed, number, episode)
-        play(recorder.act, recorder, deterministic, own_seed, max_steps=min(left, max_steps))
+        most, hold = min(left, max_steps), policy.policy.hold
+        play(recorder.act, recorder, deterministic, own_seed, max_steps=most, hold=hold)
         episode += 1
     recorder.leave()
     return _played(recorder, [], None)

@@ -6,14 +6,16 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from sauna.algorithm.policy.normalize import Moments, scale_rewards
 from sauna.algorithm.rollout.collected import capacity
-from sauna.algorithm.types import Rollout
+from sauna.algorithm.types import Memory, Rollout
 from sauna.config.settings import Config
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import environments
 from sauna.experiments.inspect.learned import reads_rollouts
@@ -51,7 +53,7 @@ def more_plays(
     close(env)
     plays = [played]
     for n in range(1, number):
-        env = make_env(config.env, json.loads(config.env_kwargs))
+        env = make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config))
         length = len(played.reward)
         plays.append(play_steps(policy, env, length, deterministic, seed, n, max_steps=max_steps))
         close(env)
@@ -62,17 +64,23 @@ def stream_of(
     policy: TrainedPolicy, config: Config, own: Mapping[str, np.ndarray], played: Played
 ) -> Rollout:
     """A play as the collector would hand it on, `[L]`; `own` are the member's arrays."""
-    value, vex = policy.heads(played.observation)
     ends = np.flatnonzero(played.terminated | played.truncated)
     if len(played.final) > len(ends):
-        ends = np.append(ends, len(value) - 1)  # the episode was left there
+        ends = np.append(ends, len(played.reward) - 1)  # the episode was left there
+    memory = None
+    if policy.policy.state_size:
+        scores, after, memory = remembered(policy, played, ends)
+        log_prob, value, vex = scores.T
+    else:
+        value, vex = policy.heads(played.observation)
+        log_prob = policy.log_prob(played.observation, played.action)
+        after = policy.heads(played.final)[0]
     next_value = np.append(value[1:], 0.0).astype(np.float32)
-    after = policy.heads(played.final)[0]
     next_value[ends] = np.where(played.terminated[ends], 0.0, after)
     columns: dict[str, Any] = {
         "observation": played.observation,
         "action": played.action,
-        "log_prob": policy.log_prob(played.observation, played.action),
+        "log_prob": log_prob,
         "reward": scaled(config, own, played.reward).astype(np.float32),
         "value": value,
         "next_value": next_value,
@@ -81,14 +89,37 @@ def stream_of(
         "truncated": played.truncated,
         "valid": np.ones(len(value), bool),
         "keep": np.ones(len(value), bool),
+        "memory": memory,
     }
     return Rollout(**columns)
 
 
+def remembered(
+    policy: TrainedPolicy, played: Played, ends: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Memory]:
+    """What a recurrent policy gives for a play, whose episodes end (or are left) at rows `ends`.
+
+    Returns:
+      log-probability, value and Vex `[L, 3]`; the value where each episode ended `[E]`, which the
+      policy sees after its last row; where episodes start `[L]`, and the state before every row
+      `[L, H]`.
+    """
+    behind = ends + 1  # the final observations stand there, each before a start
+    start = np.isin(np.arange(len(played.reward)), [0, *behind])
+    scores, state = policy.scores(
+        np.insert(played.observation, behind, played.final, 0),
+        np.insert(played.action, behind, 0, 0),
+        np.insert(start, behind, False),
+    )
+    final = behind + np.arange(len(behind))
+    own = np.delete(np.arange(len(scores)), final)
+    return scores[own], scores[final, 1], Memory(start, state[own])
+
+
 def stacked(streams: list[Rollout]) -> Rollout:
     """Streams `[L]` of N environments as one `[L, N]`."""
-    columns: Any = (np.stack(parts, 1) for parts in zip(*streams, strict=True))
-    return Rollout(*columns)
+    together: Rollout = jax.tree.map(lambda *parts: np.stack(parts, 1), *streams)
+    return together
 
 
 def scaled(config: Config, own: Mapping[str, np.ndarray], reward: np.ndarray) -> np.ndarray:

@@ -120,6 +120,8 @@ def check(configs: Sequence[Config]) -> None:
     """
     if not any(map(drops_steps, configs)):
         raise BadInput('study: measure = "noise" needs an arm that filters, with gae_over=all')
+    if any(config.recurrent != "none" for config in configs):
+        raise BadInput("recurrent: measure = noise draws single steps, which have no past")
 
 
 def drops_steps(config: Config) -> bool:
@@ -133,7 +135,7 @@ def check_spaces(config: Config, spaces: Spaces) -> None:
     Raises:
       BadInput
     """
-    if spaces.observation_kind == "image":
+    if spaces.picture_shapes:
         raise BadInput(
             "measure: noise keeps rollouts of observations in memory, which images are too large "
             "for"

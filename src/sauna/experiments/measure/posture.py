@@ -16,6 +16,7 @@ import numpy as np
 from sauna.algorithm.rollout.play import play
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_drawn_env, make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.evaluate.video import choose_renderer, not_drawn
 from sauna.experiments.measure.streams import MemberSnapshot
@@ -46,13 +47,14 @@ def compute(snapshot: MemberSnapshot, scale: None, file: Path) -> dict[str, Any]
     """
     artifact = load_artifact(snapshot.run, iteration=snapshot.iteration)
     name, picture = snapshot.member.name, file.with_suffix(".png")
-    kwargs = json.loads(artifact.config.env_kwargs)
-    env = make_env(artifact.config.env, kwargs)
+    kwargs, around = json.loads(artifact.config.env_kwargs), wrapping_of(artifact.config)
+    env = make_env(artifact.config.env, kwargs, around)
     policy = TrainedPolicy(artifact, name, env)
     episodes, seen = [], np.zeros(0, bool)
     for i in range(EPISODES):
         pitches: list[float] = []
-        played = play(policy, env, False, SEED + i, lambda: pitches.append(pitch(env)))  # noqa: B023
+        watch, hold = lambda: pitches.append(pitch(env)), policy.policy.hold  # noqa: B023
+        played = play(policy, env, False, SEED + i, watch, hold=hold)
         upright = np.cos(pitches) > 0
         seen = np.concatenate([seen, upright])
         episodes.append(
@@ -92,8 +94,9 @@ def _draw(
             pictures[step] = Image.fromarray(env.render()).resize((SIDE, SIDE))
 
     try:
-        env = make_drawn_env(artifact.config.env, kwargs)
-        play(TrainedPolicy(artifact, name, env), env, False, SEED + shown, look)
+        env = make_drawn_env(artifact.config.env, kwargs, wrapping_of(artifact.config))
+        policy = TrainedPolicy(artifact, name, env)
+        play(policy, env, False, SEED + shown, look, hold=policy.policy.hold)
     except Exception as error:  # renderers fail in every way there is
         return {"frames": [], "not_drawn": not_drawn(error)}
     strip = Image.new("RGB", (SIDE * len(pictures), SIDE))

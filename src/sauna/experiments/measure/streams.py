@@ -28,6 +28,7 @@ from sauna.config.stored import read_stored
 from sauna.config.trust import check_trusted
 from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import Spaces, read_spaces
+from sauna.envs.wrapping import wrapping_of
 from sauna.system import run_directory
 from sauna.system.checkpoint import BadCheckpoint, load_checkpoint, under
 from sauna.training.loop.budget import hypers_now
@@ -125,7 +126,7 @@ def fresh_streams(
     random = np.random.default_rng(roots)
     seeds = [int(seed) for seed in roots.generate_state(number)]
     pairs = [(seed, n) for seed in seeds for n in range(config.envs)]
-    how = config.backend, config.rescale_actions
+    how = config.backend, config.rescale_actions, wrapping_of(config)
     made = in_process_envs(config.env, json.loads(config.env_kwargs), pairs, *how)
     envs = _Recorded(made)
     try:

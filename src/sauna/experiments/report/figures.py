@@ -199,7 +199,7 @@ def looks_of(results: Mapping[str, Any]) -> dict[str, style.Look]:
 def _curve_panels(
     results: Mapping[str, Any], summary: Mapping[str, Any], metric: str
 ) -> list[Panel]:
-    configs = {(cell["task"], cell["label"]): cell["config"] or {} for cell in results["cells"]}
+    configs = {(cell["task"], cell["label"]): cell.get("config") or {} for cell in results["cells"]}
     panels = []
     for task, of_label in summary["curves"].items():
         lines = []

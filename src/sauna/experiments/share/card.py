@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,8 @@ from sauna.config.stored import read_stored
 from sauna.experiments.study.results import typed
 from sauna.system.errors import SaunaError, printable
 
+PLACE = "THIS_FOLDER"
+NAMED = re.compile(r'(?<=sauna eval )\S+|(?<=sauna.load\(")[^"]*')  # in the card
 TEXT = """---
 {front}
 ---
@@ -27,14 +30,14 @@ A policy that SAUNA trained for {steps} env steps: member `{member}`{best}.
 
 ```bash
 pip install sauna-rl
-sauna eval PATH --deterministic --episodes 20
+sauna eval {place} --deterministic --episodes 20
 ```
 
 ```python
 import gymnasium
 import sauna
 
-policy = sauna.load("PATH")  # this folder
+policy = sauna.load("{place}")
 action = policy(observation)  # the most likely action for a raw observation
 ```
 
@@ -69,6 +72,7 @@ def card(manifest: Mapping[str, Any], folder: Path) -> str:
     kwargs = config["env_kwargs"]
     return TEXT.format(
         front=_front(manifest),
+        place=PLACE,
         algorithm=config["algorithm"].upper(),
         env=_code(config["env"]),
         steps=f"{manifest['env_steps']:,}",
@@ -81,6 +85,11 @@ def card(manifest: Mapping[str, Any], folder: Path) -> str:
         action=_code(action),
         trained=_trained(manifest),
     )
+
+
+def placed(text: str, place: str) -> str:
+    """A card, which may have been edited, that names another place: `hf:USER/NAME`."""
+    return NAMED.sub(place, text)
 
 
 def _code(text: str) -> str:

@@ -21,6 +21,7 @@ from sauna.config.stored import to_stored
 from sauna.config.trust import seal
 from sauna.envs.host.answers import close
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.episodes import statistics
 from sauna.experiments.evaluate.play import Progress
@@ -101,7 +102,8 @@ def export(
         raise BadInput(f"unknown argument {next(iter(rest))!r}")
     from sauna.experiments.evaluate.policy import TrainedPolicy  # imports JAX: after the checks
 
-    env = make_env(artifact.config.env, json.loads(artifact.config.env_kwargs))
+    config = artifact.config
+    env = make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config))
     try:
         policy = TrainedPolicy(artifact, name, env, best)
         blob = _state(artifact, name, best)

@@ -16,15 +16,24 @@ def add_commands(commands: Any) -> None:
     export = commands.add_parser("export", help=text, allow_abbrev=False)
     _add_export(export)
     export.add_argument("--to", metavar="DIR", required=True, help="the folder, new or empty")
+    text = "upload one policy to the Hugging Face Hub, with its model card"
+    push = commands.add_parser("push", help=text, allow_abbrev=False)
+    _add_export(push)
+    push.add_argument("repo", metavar="USER/NAME", help="the repository; made if there is none")
+    text = "if the repository is made, only its owner sees it"
+    push.add_argument("--private", action="store_true", help=text)
+    push.add_argument("--revision", help="a branch, made if there is none (default: the main one)")
+    text = "fetch a policy from the Hugging Face Hub; nothing of it is executed"
+    pull = commands.add_parser("pull", help=text, allow_abbrev=False)
+    pull.add_argument("name", metavar="USER/NAME[@REVISION]", help="the repository")
+    pull.add_argument("to", metavar="DIR", help="the folder, new or empty")
 
 
 def _add_export(command: Any) -> None:
     """Adds what says which policy is written, and how."""
     text = "run directory, or an exported policy"
     command.add_argument("run", metavar="RUN", help=text)
-    command.add_argument(
-        "--member", default="0", help="name (sauna/0) or index; default: the first"
-    )
+    command.add_argument("--member", help="name (sauna/0) or index; default: the first")
     text = "as it was at its best evaluation during training"
     command.add_argument("--best", action="store_true", help=text)
     text = "also as ONNX, from the raw observation to the most likely action"
@@ -32,9 +41,9 @@ def _add_export(command: Any) -> None:
     text = "also as a Python file that needs numpy and safetensors alone"
     command.add_argument("--numpy", action="store_true", help=text)
     text = "episodes of the model card's return, of the most likely actions (default 20; 0: none)"
-    command.add_argument("--episodes", default="20", help=text)
+    command.add_argument("--episodes", help=text)
     text = "seed of their first episode (default 1000)"
-    command.add_argument("--seed", default="1000", help=text)
+    command.add_argument("--seed", help=text)
     command.add_argument("--trust", action="store_true", help=TRUST)
 
 
@@ -44,13 +53,39 @@ def export_from_flags(values: dict[str, Any]) -> None:
     Raises:
       BadInput: as `export`.
     """
-    values |= {name: whole_number(values, name, 0) for name in ("episodes", "seed")}
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("PJRT_NPROC", "1")
     from sauna.experiments.share.export import export
 
-    folder = export(**values)
-    print(f"policy: {folder}")
+    print(f"policy: {export(**_read(values))}")
 
 
-COMMANDS = {"export": export_from_flags}
+def _read(values: dict[str, Any]) -> dict[str, Any]:
+    """Reads what was given of an export, and keeps JAX to one thread of the CPU."""
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("PJRT_NPROC", "1")
+    given = {name: value for name, value in values.items() if value not in (None, False)}
+    return given | {n: whole_number(given, n, 0) for n in ("episodes", "seed") if n in given}
+
+
+def push_from_flags(values: dict[str, Any]) -> None:
+    """Runs `sauna push`.
+
+    Raises:
+      BadInput, SaunaError: as `push`.
+    """
+    from sauna.experiments.share.exchange import push
+
+    print(f"pushed: {push(**_read(values))}")
+
+
+def pull_from_flags(values: dict[str, Any]) -> None:
+    """Runs `sauna pull`.
+
+    Raises:
+      BadInput, SaunaError: as `pull`.
+    """
+    from sauna.experiments.share.exchange import pull
+
+    print(f"policy: {pull(**values)}")
+
+
+COMMANDS = {"export": export_from_flags, "push": push_from_flags, "pull": pull_from_flags}

@@ -25,6 +25,7 @@ OPERATIONS = {
     "Relu": "np.maximum({0}, 0)",
     "Reshape": "{0}.reshape(-1, {shape})",
     "Slice": "{0}[..., {start}:{end}]",
+    "Softplus": "np.logaddexp({0}, 0)",
     "Sub": "{0} - {1}",
     "Tanh": "np.tanh({0})",
     "Transpose": "{0}.transpose({perm})",

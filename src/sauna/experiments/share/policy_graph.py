@@ -13,6 +13,7 @@ import numpy as np
 
 from sauna.algorithm.policy.convolutions import LAYERS
 from sauna.algorithm.policy.normalize import EPSILON
+from sauna.config.choices import BOUNDED
 from sauna.config.settings import Config
 from sauna.envs.spaces import Spaces, describe, stretch
 from sauna.experiments.share.graph import Graph
@@ -50,6 +51,8 @@ def policy_graph(
     else:
         features = _nature_cnn(graph, arrays, seen, trunk)
     parameters = _dense(graph, arrays, features, "policy_head")
+    if spaces.action_kind == "continuous" and config.distribution in BOUNDED:
+        parameters = _bounded(graph, config.distribution, spaces.action_width, parameters)
     _action(graph, spaces, action_space, parameters, config.rescale_actions)
     return graph
 
@@ -63,12 +66,18 @@ def _check(config: Config, spaces: Spaces) -> None:
     unknown = ""
     if config.network not in NETWORKS:
         unknown = f"network {config.network}; only {' and '.join(NETWORKS)} are"
+    elif config.recurrent != "none":
+        unknown = f"recurrent {config.recurrent}"
     elif config.network == "mlp" and config.activation not in ACTIVATIONS:
         unknown = f"activation {config.activation}"
     elif config.network == "mlp" and config.layer_norm:
         unknown = "layer_norm"
     elif spaces.observation_kind not in ("vector", "one_hot", "image"):
         unknown = f"observations of kind {spaces.observation_kind}"
+    elif config.action_mask:
+        unknown = "action_mask"
+    elif spaces.pictures:
+        unknown = "pictures beside other observations"
     if unknown:
         raise BadInput(f"export: not written as ONNX or numpy: {unknown}")
 
@@ -188,6 +197,16 @@ def _nature_cnn(graph: Graph, arrays: Arrays, x: str, trunk: str) -> str:
     size = arrays[f"params/{trunk}/dense/kernel"].shape[0]
     x = graph.add("Reshape", x, shape=(size,))
     return graph.add("Relu", _dense(graph, arrays, x, f"{trunk}/dense"))
+
+
+def _bounded(graph: Graph, distribution: str, width: int, x: str) -> str:
+    """The deterministic action in [-1, 1], of a distribution of `bounded.py`."""
+    if distribution == "squashed":
+        return graph.add("Tanh", x)
+    one = graph.constant("beta/one", np.float32(1))
+    both = graph.add("Add", graph.add("Softplus", x), one)
+    a, b = (graph.add("Slice", both, start=i, end=i + width) for i in (0, width))
+    return graph.add("Div", graph.add("Sub", a, b), graph.add("Add", a, b))
 
 
 def _action(graph: Graph, spaces: Spaces, space: Any, parameters: str, rescale: bool) -> None:

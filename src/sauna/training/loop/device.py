@@ -26,6 +26,7 @@ from sauna.config.presets import Member
 from sauna.config.settings import Config, fields_with, to_json
 from sauna.envs.device.contract import flat
 from sauna.envs.device.make import make_jax_env
+from sauna.envs.device.stacked import stacked
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
@@ -136,7 +137,8 @@ def _settings(job: Job) -> str:
 def make_population(job: Job) -> Population:
     """The job's members at the start of their training."""
     config = job.config
-    env = flat(make_jax_env(config.env, job.env_kwargs), config.rescale_actions)
+    env = stacked(make_jax_env(config.env, job.env_kwargs), config.stack)
+    env = flat(env, config.rescale_actions, config.action_mask)
     settings = [_setting(member) for member in job.members]
     devices = _devices(config)
     mesh = make_mesh(len(settings), config.envs, devices)
@@ -209,9 +211,12 @@ def _check_finite(member: Member, iteration: int, report: Report) -> None:
         return
     if report.faults.found:
         what = "reward" if report.faults.in_reward else "observation"
+        masked = member.config.action_mask and what == "observation"
         raise EnvironmentFailure(
             f"environment {report.faults.env} of {member.name}, iteration {iteration}, step "
             f"{report.faults.row} of the rollout: {what} is not finite or beyond {LARGEST:g}"
+            + ", or its action mask leaves no valid action"
+            * masked
         )
     check_finite(member, iteration, report.learned)
 

@@ -77,7 +77,8 @@ def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, any_member: Any)
       any_member: see `jax_env.advance`.
     """
     policy = make_policy(config, spaces)
-    collecting = Collecting(config, env, policy, make_filter(config), any_member)
+    rule = make_filter(config)
+    collecting = Collecting(config, env, policy, rule, any_member, spaces.normalized)
     return IterationParts(config, collecting, policy, make_parts(config, policy, spaces))
 
 
@@ -314,7 +315,7 @@ def shardings(mesh: Mesh, states: MemberState) -> Any:
     members = NamedSharding(mesh, PartitionSpec(MEMBERS))
     envs = NamedSharding(mesh, PartitionSpec(MEMBERS, ENVS))
     places = jax.tree.map(lambda _: members, states)
-    per_env = ("envs", "discounted_return", "episode_return", "episode_length")
+    per_env = ("envs", "discounted_return", "episode_return", "episode_length", "memory")
     collect = places.collect._replace(
         **{name: jax.tree.map(lambda _: envs, getattr(states.collect, name)) for name in per_env}
     )

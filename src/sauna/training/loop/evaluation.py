@@ -29,6 +29,7 @@ from sauna.envs.host.answers import close
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.envs.make import make_env
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.checkpoint import under
 from sauna.system.errors import one_line
 from sauna.training.loop.job import Arrays, Job
@@ -222,11 +223,12 @@ class HostPlayer:
     def __call__(self, frozen: Frozen, seeds: Sequence[int]) -> list[Episode]:
         config = self._job.config
         if self._policy is None:
-            self._env = make_env(config.env, dict(self._job.env_kwargs))
+            kwargs = dict(self._job.env_kwargs)
+            self._env = make_env(config.env, kwargs, wrapping_of(config))
             self._policy = FrozenPolicy(config, self._job.spaces, self._env)
         self._policy.load(frozen.params, frozen.moments)
-        deterministic = config.eval_deterministic
-        return [play(self._policy, self._env, deterministic, seed) for seed in seeds]
+        how, hold = config.eval_deterministic, self._policy.policy.hold
+        return [play(self._policy, self._env, how, seed, hold=hold) for seed in seeds]
 
     def close(self) -> None:
         """Closes the environment, if there is one."""

@@ -25,6 +25,7 @@ from sauna.config.presets import Member
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
+from sauna.envs.wrapping import wrapping_of
 from sauna.system.checkpoint import under
 from sauna.training.loop.budget import budget_left, hypers_now, step_limit
 from sauna.training.loop.evaluation import Evaluator, Frozen, HostPlayer, stop_named
@@ -120,13 +121,12 @@ def make_envs(job: Job) -> HostEnvs:
     """The `P * N` environments of the job, in this process or in workers."""
     config = job.config
     seeds = [(member.seed, n) for member in job.members for n in range(config.envs)]
+    how = config.backend, config.rescale_actions, wrapping_of(config)
     if config.env_processes:
         processes = min(config.env_processes, len(seeds))
-        how = config.env_timeout, config.backend, config.rescale_actions
-        return ProcessEnvs(config.env, job.env_kwargs, seeds, processes, *how)
-    return in_process_envs(
-        config.env, job.env_kwargs, seeds, config.backend, config.rescale_actions
-    )
+        timeout = config.env_timeout
+        return ProcessEnvs(config.env, job.env_kwargs, seeds, processes, timeout, *how)
+    return in_process_envs(config.env, job.env_kwargs, seeds, *how)
 
 
 def _start(

@@ -290,7 +290,8 @@ def moments_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
 
 def collected_of(collector: HostCollector, p: int) -> dict[str, np.ndarray]:
     """Views of what member `p` carries from one rollout to the next, by their names."""
-    return {f"collect/{key}": value[p] for key, value in collector.state._asdict().items()}
+    carried = collector.state._asdict().items()
+    return {f"collect/{key}": x[p] for key, x in carried if not isinstance(x, tuple)}
 
 
 def _check_replayed(name: str, n: int, stored: np.ndarray, seen: np.ndarray) -> None:

@@ -159,7 +159,8 @@ def test_a_policy_of_agents_is_evaluated_on_all_of_them() -> None:
     assert (terminated, truncated, info) == (False, True, {"is_success": 1.0})
 
 
-def test_agents_train_resume_exactly_and_are_refused_what_they_cannot_do() -> None:
+@pytest.mark.slow
+def test_agents_train_and_resume_exactly() -> None:
     settings = {"arm": "ppo", "envs": 3, "rollout_steps": 24, "minibatches": 2, "eval_every": 72}
     job = make_job("vector_worlds:Agents", **settings, eval_episodes=1, steps=216)
     whole, first = train_here(job), train_here(job, 1)
@@ -167,12 +168,15 @@ def test_agents_train_resume_exactly_and_are_refused_what_they_cannot_do() -> No
     assert equal(again.final, whole.final) and first.rows + again.rows == whole.rows
     lengths = {n for row in whole.rows for n in row["episode_lengths"]}
     assert lengths == {2, 3, 4} and "eval_return_mean" in whole.rows[-1]
-    with pytest.raises(BadInput, match="envs: 2 is no multiple of the 3 agents"):
-        make_job("vector_worlds:Agents", arm="ppo", envs=2)
-    with pytest.raises(BadInput, match="agent b has another observation space than a"):
-        make_job("vector_worlds:Agents", arm="ppo", envs=3, env_kwargs='{"wide": true}')
     masked = {"arm": "sauna", "envs": 3, "dropped": "mask", "rollout_steps": 24, "steps": 72}
     with pytest.raises(EnvironmentFailure, match="a step filter cannot pass over that"):
         train_here(make_job("vector_worlds:Agents", **masked))
     kwargs = '{"together": true}'
     assert train_here(make_job("vector_worlds:Agents", env_kwargs=kwargs, **masked)).rows
+
+
+def test_agents_are_refused_what_they_cannot_do() -> None:
+    with pytest.raises(BadInput, match="envs: 2 is no multiple of the 3 agents"):
+        make_job("vector_worlds:Agents", arm="ppo", envs=2)
+    with pytest.raises(BadInput, match="agent b has another observation space than a"):
+        make_job("vector_worlds:Agents", arm="ppo", envs=3, env_kwargs='{"wide": true}')

@@ -1,0 +1,104 @@
+"""Two searches by `sauna tune` from a poor start, and populations beside random searches.
+
+    python results/tune.py              trains what is missing under runs/, then writes the numbers
+    python results/tune.py --collect    writes `results/tune.json` from what runs/ holds
+
+On a shared core the whole takes about two hours.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset's
+SEARCHES = {
+    "Pendulum-v1": f"{START} --envs 4 --steps 4e4",
+    "LunarLander-v3": f"{START} --envs 16 --rollout-steps 256 --steps 3e4",
+}
+OF_SEARCH = "--trials 40 --lockstep 8"
+SPACE = """
+learning_rate = {low = 1e-5, high = 1e-2, log = true}
+clip_range = [0.1, 0.2, 0.3, 0.4]
+gamma = [0.9, 0.95, 0.98, 0.99, 0.995, 0.999]
+gae_lambda = [0.8, 0.9, 0.95, 0.98, 1.0]
+entropy_coef = {low = 1e-8, high = 0.1, log = true}
+value_coef = {low = 0.1, high = 2.0}
+max_grad_norm = [0.3, 0.5, 1.0, 2.0, 5.0]
+"""
+SEEDS = range(5)
+EQUAL = (
+    f"Pendulum-v1 {START} --envs 4 --rollout-steps 128 --minibatches 4 --epochs 5 --steps 4e4 "
+    "--trials 8 --finalists 1 --fresh-seeds 0 --space runs/traced.toml"
+)
+KINDS = {
+    "population": "--population-based --exchange-every 4096",
+    "random": "--search random --pruner none --lockstep 8",
+}
+KEPT = ("number", "state", "return", "env_steps", "searched", "error")
+
+
+def commands() -> dict[str, str]:
+    """Lists every command, by the name of its results."""
+    found = {env: f"sauna tune {env} {more} {OF_SEARCH}" for env, more in SEARCHES.items()}
+    for seed in SEEDS:
+        for kind, more in KINDS.items():
+            found[f"{kind} {seed}"] = f"sauna tune {EQUAL} {more} --seed {seed}"
+    return found
+
+
+def collect() -> dict[str, Any]:
+    """Reads what the folders under runs/ hold, found by their settings."""
+    stored = [json.loads(path.read_text()) for path in Path("runs").glob("tune_*/results.json")]
+    searches, equal = {}, {kind: {} for kind in KINDS}
+    for found in stored:
+        plan = found["tune"]
+        if "rollout_steps" in plan["values"]:
+            searches[found["env"]] = search(found)
+        else:
+            kind = "population" if plan["exchange_every"] else "random"
+            equal[kind][str(plan["seeds"][0])] = {
+                "returns": [trial["return"] for trial in found["trials"]],
+                "env_steps": found["env_steps"]["trials"],
+                "exchanges": len(found["exchanges"]),
+            }
+    return {"commands": commands(), "searches": searches, "equal_steps": equal}
+
+
+def search(found: dict[str, Any]) -> dict[str, Any]:
+    """Keeps of a search what the page shows, and the table of trials."""
+    kept = ("metric", "steps", "env_steps", "importance", "fresh_seeds", "verdict", "versions")
+    tables = {
+        name: [
+            {key: row[key] for key in ("label", "seeds", "failed", "final_mean", "final_std")}
+            for row in found[name].get("table", [])
+        ]
+        for name in ("finalists", "fresh")
+    }
+    return {
+        **{name: found[name] for name in kept},
+        "best": found["best"] and found["best"]["number"],
+        "settings": found["best"] and found["best"]["settings"],
+        **tables,
+        "verdicts": [verdict["text"] for verdict in found["fresh"].get("verdicts", [])],
+        "trials": [{key: t[key] for key in KEPT if key in t} for t in found["trials"]],
+    }
+
+
+def main() -> None:
+    if "--collect" not in sys.argv:
+        Path("runs").mkdir(exist_ok=True)
+        Path("runs/traced.toml").write_text(SPACE)
+        for command in commands().values():
+            subprocess.run([sys.executable, "-m", *shlex.split(command)], check=True)
+    path = ROOT / "results" / "tune.json"
+    path.write_text(json.dumps(collect(), indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,346 @@
+"""Population-based training: the worst copy the best and change its settings while they train.
+
+    M. Jaderberg et al. (2017), Population Based Training of Neural Networks, arXiv:1711.09846
+
+The members are the arms of one run, in lockstep. At equal intervals the run pauses, its checkpoint
+is changed as `exchange` says, and the run goes on from that. A checkpoint names the settings of the
+members at its iteration, so that a killed population goes on from its newest one, and makes an
+exchange that was lost again, the same: draws follow from the seed and the iteration.
+
+    population/run               the run
+    population/exchanges.jsonl   every exchange
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sauna.config.presets import RunConfig
+from sauna.config.settings import to_json
+from sauna.config.stored import read_stored, to_stored
+from sauna.experiments.tune.batch import prepared_batch, train
+from sauna.experiments.tune.plan import Plan
+from sauna.experiments.tune.space import Range, Space, as_choice, start_of
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput
+from sauna.system.safe_write import own_folder, replace_file
+from sauna.training.display import Display
+from sauna.training.prepare import Prepared
+
+FOLDER, LOG = "population", "exchanges.jsonl"
+EXPLOITED = 0.2  # share of the members that are replaced, and of those that are copied
+FACTORS = (0.8, 1.2)  # that change a number
+DRAWN_ANEW = 0.25  # probability with which a setting is drawn from its range instead
+DONE = "exchanged"  # in the manifest of a checkpoint that was changed
+FORMER = ("format", "iteration", "sha256", "bytes", "manifest_sha256", DONE)  # written anew
+POINTS = 20  # of a member's curve that are kept
+# What is a member's own and stays, by the first part of an array's name; the rest is learned.
+OWN = ("counters", "collect", "envs", "evaluation", "best")
+LEARNED = ("collect/observation_moments", "collect/reward_moments")  # as the device keeps them
+
+
+class Exchange(NamedTuple):
+    """One member that copied another.
+
+    Attributes:
+      iteration: at whose start.
+      env_steps: of each member until then.
+      member, source: who copied whom; numbers.
+      score, source_score: mean return of the episodes since the exchange before.
+      copied: the source's settings.
+      settings: what the member goes on with.
+    """
+
+    iteration: int
+    env_steps: int
+    member: int
+    source: int
+    score: float
+    source_score: float
+    copied: dict[str, Any]
+    settings: dict[str, Any]
+
+
+def arm_of(number: int) -> str:
+    """Names the arm of a member."""
+    return f"member-{number}"
+
+
+def samples_of(start: Prepared) -> int:
+    """Counts the env steps of a member's iteration."""
+    return start.config.rollout_steps * start.config.envs
+
+
+def iterations_between(plan: Plan, start: Prepared) -> int:
+    """Counts the iterations between two exchanges."""
+    return max(plan.exchange_every // samples_of(start), 1)
+
+
+def check_population(plan: Plan, start: Prepared) -> None:
+    """Refuses a population that cannot be trained.
+
+    Raises:
+      BadInput: there are several seeds, or no exchange would happen.
+    """
+    if len(plan.seeds) > 1:
+        raise BadInput("seeds: a population has one, which all its members share")
+    if iterations_between(plan, start) >= start.config.steps // samples_of(start):
+        raise BadInput(
+            f"exchange_every: the first exchange, after {plan.exchange_every} env steps, would "
+            f"come after the last iteration"
+        )
+
+
+class Population:
+    """A population of a plan in a folder.
+
+    Args:
+      plan: what is searched; its trials are the members.
+      start: what every member starts from, prepared.
+      folder: of the tuning.
+      display: makes what shows a training.
+      accept_changed_code: continue a run whose code is not what it was.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        start: Prepared,
+        folder: Path,
+        display: Callable[[], Display],
+        accept_changed_code: bool = False,
+    ) -> None:
+        self._plan, self._start = plan, start
+        self._folder, self._run = folder / FOLDER, folder / FOLDER / "run"
+        self._display, self._accept = display, accept_changed_code
+        self._space, self._samples = plan.space, samples_of(start)
+        self._every = iterations_between(plan, start)
+
+    def run(self) -> None:
+        """Trains the population to its end.
+
+        Raises:
+          Interrupted: a signal came; running again continues.
+          SaunaError: the training failed.
+        """
+        own_folder(self._folder)
+        whole = {
+            arm_of(number): {**self._plan.settings, **settings}
+            for number, settings in enumerate(self._first())
+        }
+        first = prepared_batch(whole, self._plan.seeds, self._start, self._run)
+        if run_directory.is_complete(self._run):
+            return
+        last = first.config.steps // self._samples
+        at = self._aligned(first)
+        for iteration in range(self._every, last, self._every):
+            if iteration > at:
+                self._train(first, iteration)
+            if iteration >= at:
+                self._exchange(iteration)
+        self._train(first, None)
+
+    def _train(self, first: Prepared, until: int | None) -> None:
+        train(first, self._display(), None, self._accept, until)
+
+    def _first(self) -> list[dict[str, Any]]:
+        """The settings with which the members begin; the first has the start's."""
+        found = []
+        for number in range(self._plan.trials):
+            draw = np.random.default_rng([self._plan.seeds[0], number])
+            found.append({name: drawn(one, draw) for name, one in self._space.items()})
+        found[0] |= start_of(self._space, self._start.config)
+        return found
+
+    def _aligned(self, first: Prepared) -> int:
+        """Makes the run's config that of its newest checkpoint; returns the iteration of it."""
+        if not (self._run / "config.json").is_file():
+            return 0
+        newest = checkpoint.load_newest(self._run / "checkpoints", self._display().say)
+        settings = newest.manifest if newest else to_stored(first.run)
+        stored = run_directory.read_config(self._run)
+        ours = {name: settings[name] for name in ("config", "arms")}
+        run_directory.write_config(self._run, {**stored, **ours})
+        return int(newest.manifest["iteration"]) if newest else 0
+
+    def _exchange(self, iteration: int) -> None:
+        """Changes the checkpoint at `iteration` and logs how, unless that was done."""
+        newest = checkpoint.load_newest(self._run / "checkpoints", self._display().say)
+        assert newest is not None and newest.manifest["iteration"] == iteration
+        if DONE in newest.manifest:
+            return
+        run = read_stored(newest.manifest)
+        rows = run_directory.rows(self._run)
+        scores = [self._score(rows, number, iteration) for number in range(self._plan.trials)]
+        settings = [settings_in(run, number, self._space) for number in range(len(scores))]
+        draw = np.random.default_rng([self._plan.seeds[0], self._plan.trials, iteration])
+        steps = iteration * self._samples
+        made = exchanges(scores, settings, self._space, draw, iteration, steps)
+        arrays = dict(newest.arrays)
+        for one in made:
+            arrays |= copied(newest.arrays, *(self._member(n) for n in (one.source, one.member)))
+            run = with_settings(run, arm_of(one.member), one.settings)
+        self._log(made, iteration)
+        self._save(newest, arrays, run, run_directory.read_config(self._run))
+
+    def _member(self, number: int) -> str:
+        return f"{arm_of(number)}/{self._plan.seeds[0]}"
+
+    def _score(self, rows: list[dict[str, Any]], number: int, iteration: int) -> float:
+        """Mean return of a member's episodes since the last exchange; NaN without any."""
+        returns = [
+            return_
+            for row in rows
+            if row["arm"] == arm_of(number) and iteration - self._every <= row["iteration"]
+            for return_ in row["episode_returns"]
+        ]
+        return float(np.mean(returns)) if returns else math.nan
+
+    def _log(self, made: Sequence[Exchange], iteration: int) -> None:
+        """Logs exchanges; those of a later state, which a kill has undone, go."""
+        before = [row for row in exchanges_in(self._folder.parent) if row["iteration"] < iteration]
+        rows = [*before, *(one._asdict() for one in made)]
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        replace_file(self._folder / LOG, text.encode())
+
+    def _save(
+        self,
+        newest: checkpoint.Checkpoint,
+        arrays: dict[str, np.ndarray],
+        run: RunConfig,
+        stored: Mapping[str, Any],
+    ) -> None:
+        """Puts the changed checkpoint in the place of the one before the exchange."""
+        iteration = newest.manifest["iteration"]
+        manifest = {name: value for name, value in newest.manifest.items() if name not in FORMER}
+        manifest |= {**to_stored(run), DONE: True}
+        former = newest.path.with_name(f".writing-before-{iteration:08d}")
+        shutil.rmtree(former, ignore_errors=True)
+        newest.path.rename(former)
+        keep = run.config.keep_checkpoints
+        checkpoint.save_checkpoint(newest.path.parent, iteration, arrays, manifest, keep)
+        run_directory.write_config(self._run, {**stored, **to_stored(run)})
+
+    def ended(self) -> list[dict[str, Any]]:
+        """Lists the members as JSON values, as `Search.ended` lists trials."""
+        if not (self._run / "config.json").is_file():
+            return []
+        run = read_stored(run_directory.read_config(self._run))
+        rows = run_directory.rows(self._run)
+        complete = run_directory.is_complete(self._run)
+        return [
+            self._as_json(run, [row for row in rows if row["arm"] == arm_of(number)], number)
+            | {"state": "complete" if complete else "running"}
+            for number in range(self._plan.trials)
+        ]
+
+    def importance(self) -> dict[str, float]:
+        """Nothing: the settings of a member change."""
+        return {}
+
+    def _as_json(self, run: RunConfig, rows: list[dict[str, Any]], number: int) -> dict[str, Any]:
+        settings, steps = settings_in(run, number, self._space), run.config.steps
+        curve = [[r["env_steps"] / steps, r["return_mean"]] for r in rows if "return_mean" in r]
+        places = np.linspace(0, len(curve) - 1, POINTS if curve else 0).astype(int)
+        return {
+            "number": number,
+            "return": curve[-1][1] if curve else None,
+            "env_steps": rows[-1]["env_steps"] if rows else 0,
+            "searched": settings,
+            "settings": settings,
+            "curve": [curve[i] for i in np.unique(places).tolist()],
+        }
+
+
+def drawn(one: Range, draw: np.random.Generator) -> Any:
+    """Draws a value of a range."""
+    if one.choices:
+        return one.choices[int(draw.integers(len(one.choices)))]
+    if one.log:
+        value = math.exp(draw.uniform(math.log(one.low), math.log(one.high)))
+    else:
+        value = float(draw.uniform(one.low, one.high))
+    return one.inside(value)
+
+
+def explored(one: Range, value: Any, draw: np.random.Generator) -> Any:
+    """Changes a value: a number by a factor, a choice to one beside it; or draws it anew."""
+    if draw.random() < DRAWN_ANEW:
+        return drawn(one, draw)
+    up = bool(draw.random() < 0.5)
+    if one.choices:
+        place = one.choices.index(one.inside(value)) + (1 if up else -1)
+        return one.choices[min(max(place, 0), len(one.choices) - 1)]
+    return one.inside(value * FACTORS[up])
+
+
+def exchanges(
+    scores: Sequence[float],
+    settings: Sequence[Mapping[str, Any]],
+    space: Space,
+    draw: np.random.Generator,
+    iteration: int,
+    env_steps: int,
+) -> list[Exchange]:
+    """Decides who copies whom, by truncation, and with which settings they go on.
+
+    Each of the worst fifth copies one of the best fifth, drawn at random, that is better. A member
+    without a score takes no part.
+
+    Args:
+      scores: of the members; NaN if no episode has ended.
+      settings: of the members, as they are searched.
+    """
+    ranked = [n for n in np.argsort(scores, kind="stable").tolist() if math.isfinite(scores[n])]
+    number = max(1, round(EXPLOITED * len(ranked)))
+    if len(ranked) < 2:
+        return []
+    made = []
+    for member in ranked[:number]:
+        source = ranked[-1 - int(draw.integers(number))]
+        if scores[source] <= scores[member]:
+            continue
+        from_ = dict(settings[source])
+        after = {name: explored(one, from_[name], draw) for name, one in space.items()}
+        pair = scores[member], scores[source]
+        made.append(Exchange(iteration, env_steps, member, source, *pair, from_, after))
+    return made
+
+
+def copied(arrays: Mapping[str, np.ndarray], source: str, member: str) -> dict[str, np.ndarray]:
+    """Returns what `source` has learned under `member`'s names: parameters, optimizer, moments.
+
+    Its counters, its environments and their episodes stay the member's own.
+    """
+    return {
+        f"{member}/{name}": array
+        for name, array in checkpoint.under(f"{source}/", arrays).items()
+        if name.split("/")[0] not in OWN or name.startswith(LEARNED)
+    }
+
+
+def settings_in(run: RunConfig, number: int, space: Space) -> dict[str, Any]:
+    """The searched settings of a member."""
+    values = to_json(run.arms[arm_of(number)])
+    return {name: as_choice(values[name]) for name in space}
+
+
+def with_settings(run: RunConfig, arm: str, settings: Mapping[str, Any]) -> RunConfig:
+    """Changes the settings of one arm."""
+    return RunConfig(run.config, {**run.arms, arm: dataclasses.replace(run.arms[arm], **settings)})
+
+
+def exchanges_in(folder: Path) -> list[dict[str, Any]]:
+    """Reads the log of exchanges of a tuning; nothing if it has none."""
+    path = folder / FOLDER / LOG
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]

@@ -1,0 +1,132 @@
+"""What is put around environments: a user's wrappers, and the last observations as one."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+import jax_worlds
+import sauna
+import wrappers
+from helpers import equal, make_job, resumed, train_here
+from sauna.config.trust import named_code
+from sauna.envs.device.as_gymnasium import HostFace
+from sauna.envs.device.stacked import stacked
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.envs.make import in_process_envs, make_env
+from sauna.envs.stacked import StackedEnv, StackedSpace
+from sauna.envs.wrapping import Wrapping, read_wrapping
+from sauna.system.errors import BadInput
+from worlds import Finite
+
+ORDERED = ("wrappers:Double", "wrappers:plus_one")
+
+
+def test_the_last_observations_are_one_also_at_both_ends_of_an_episode() -> None:
+    env = StackedEnv(Finite(), 3)
+    for _ in range(2):
+        assert env.reset(seed=1)[0].tolist() == [0, 0, 0]
+        seen = [env.step(0)[0].tolist() for _ in range(5)]
+        assert seen == [[0, 0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]
+    envs = in_process_envs("worlds:Finite", {}, [(0, 0)], "auto", wrapping=Wrapping(stack=2))
+    envs.reset()
+    for _ in range(5):
+        step = envs.step(np.zeros((1, 1), np.int32), np.ones(1, bool))
+    assert step.final_observation.tolist() == [[4, 5]] and step.observation.tolist() == [[0, 0]]
+
+
+def test_the_device_stacks_as_the_host_does() -> None:
+    one = jax_worlds.walk
+    ours, theirs = stacked(one, 3), StackedEnv(HostFace(one), 3)
+    assert isinstance(ours.observation_space, StackedSpace)
+    assert ours.observation_space == theirs.observation_space and stacked(one, 1) is one
+    face = HostFace(ours)
+    np.testing.assert_array_equal(face.reset(seed=4)[0], theirs.reset(seed=4)[0])
+    assert np.ptp(face.reset(seed=4)[0].reshape(3, -1), 0).max() == 0
+    theirs.reset(seed=4)
+    action = one.action_space.sample()
+    for _ in range(4):
+        np.testing.assert_array_equal(face.step(action)[0], theirs.step(action)[0])
+    state, _ = jax.jit(ours.reset)(jax.random.key(0))
+    assert jax.tree.structure(state) == jax.tree.structure(ours.step(state, action).state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["host", "device"])
+def test_stacked_observations_train_are_evaluated_and_resume_exactly(place: str) -> None:
+    env = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}[place]
+    job = make_job(env, arm="ppo", stack=3, eval_every=64, eval_episodes=1)
+    width = make_job(env, arm="ppo").spaces.observation_shape[0]
+    assert job.spaces.observation_shape == (3 * width,)
+    whole, first = train_here(job), train_here(job, 2)
+    again = train_here(resumed(job, first))
+    assert equal(again.final, whole.final) and first.rows + again.rows == whole.rows
+    kernel = whole.final["ppo/0/params/policy_trunk/layer_0/kernel"]
+    assert kernel.shape[0] == 3 * width and "eval_return_mean" in whole.rows[-1]
+
+
+def test_a_policy_makes_the_environment_that_it_was_trained_on(tmp_path) -> None:
+    settings = {"steps": 64, "rollout_steps": 32, "minibatches": 4, "hidden": "4"}
+    env = {"stack": 2, "wrap": [wrappers.Double], "out": tmp_path / "run"}
+    policy = sauna.train("worlds:TwoSteps", arm="ppo", quiet=True, **settings, **env).policy()
+    made = policy.make_env()
+    seen, _ = made.reset(seed=0)
+    assert seen.tolist() == [0, 0] and policy(seen) in (0, 1)
+    made.step(0)
+    assert made.step(0)[1] == 2.0
+
+
+def test_pictures_are_not_stacked() -> None:
+    with pytest.raises(BadInput, match="stack: pictures are not stacked"):
+        make_job("worlds:Picture", arm="ppo", stack=2, network="auto")
+
+
+def test_a_users_wrappers_go_around_every_environment_in_their_order() -> None:
+    """Twice the reward, and one more; in training and in evaluations."""
+    job = make_job(
+        "worlds:TwoSteps",
+        arm="ppo",
+        normalize_rewards="no",
+        wrap=",".join(ORDERED),
+        eval_every=128,
+        eval_episodes=1,
+    )
+    found = train_here(job)
+    assert set(found.rows[-1]["episode_returns"]) == {4.0}  # (2 * 0 + 1) + (2 * 1 + 1), of 0 and 1
+    assert found.rows[-1]["eval_returns"] == [4.0]
+    envs = in_process_envs("Hopper-v5", {}, [(0, 0)], "auto", wrapping=Wrapping(ORDERED))
+    assert type(envs) is GymnasiumEnvs
+    envs.close()
+    assert read_wrapping({"wrap": list(ORDERED), "stack": 2}) == Wrapping(ORDERED, 2)
+
+
+REFUSED = [
+    ({"wrap": "wrappers:nothing"}, "wrap: wrappers:nothing gives no environment, but NoneType"),
+    ({"wrap": "wrappers:broken"}, "wrap: wrappers:broken cannot wrap the environment: .*no such"),
+    ({"wrap": "wrappers:NUMBER"}, "wrap: wrappers:NUMBER cannot be called"),
+    ({"wrap": "wrappers:Dubble"}, "wrap: module 'wrappers' has no 'Dubble'.*Double"),
+    ({"wrap": "wrappers"}, "wrap: 'wrappers' is no module:function"),
+    ({"wrap": "sauna.config.local:f_0"}, "wrap: a wrapper has to be importable"),
+    ({"env": "jax_worlds:walk", "wrap": ORDERED[0]}, "wrap: not read by arm ppo; .* on the host"),
+    ({"env": "vector_worlds:same", "wrap": ORDERED[0]}, "wrap: the rows of vector_worlds:same are"),
+    ({"env": "vector_worlds:Agents", "stack": 2}, "stack: the rows of vector_worlds:Agents are"),
+]
+
+
+@pytest.mark.parametrize("settings, words", REFUSED, ids=[str(r[0]) for r in REFUSED])
+def test_a_wrapper_that_cannot_be_used_is_refused_in_a_line(settings: dict, words: str) -> None:
+    with pytest.raises(BadInput, match=words) as error:
+        make_job(**{"env": "worlds:TwoSteps", "arm": "ppo", **settings})
+    assert "\n" not in str(error.value)
+
+
+def test_wrappers_that_somebody_else_named_need_trust() -> None:
+    stored = {"config": {"env": "CartPole-v1", "wrap": ["theirs:Wrapper"], "stack": 2}}
+    assert named_code(stored) == [["wrap", "theirs:Wrapper"]]
+
+
+def test_the_plain_form_of_an_environment_is_wrapped_too() -> None:
+    env = make_env("worlds:TwoSteps", {}, Wrapping(ORDERED, stack=2))
+    assert env.reset(seed=0)[0].tolist() == [0, 0]
+    assert env.step(0)[:2][1] == 1.0 and env.unwrapped.__class__.__name__ == "TwoSteps"

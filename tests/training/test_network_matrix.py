@@ -1,0 +1,55 @@
+"""Every selection rule works with every kind of network, at toy size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from helpers import make_job, train_here
+
+NETWORKS = {
+    "mlp": {
+        "env": "worlds:Scripted",
+        "hidden": "6",
+        "value_hidden": "5,4",
+        "activation": "elu",
+        "layer_norm": "yes",
+        "stack": 2,
+    },
+    "small-cnn": {"env": "worlds:Board", "network": "small-cnn"},
+    "impala-cnn": {"env": "worlds:Board", "network": "impala-cnn", "trunk": "shared"},
+    "rows together": {"env": "vector_worlds:same", "hidden": "6", "dropped": "mask"},
+}
+# Those whose interface to a network differs: a filter, the head's gradient, a head of its own,
+# values anew, a weight of the loss.
+KINDS = ["sauna", "gradient-norm", "merl", "recompute", "delight"]
+ARMS = [
+    *KINDS,
+    *("sauna-paper", "sauna-reference", "vex-head", "random-drop", "gigaflow", "top-advantage"),
+    *("prioritized", "kondo", "pods", "vex-oracle", "positive", "sample-dropout", "espo"),
+    *("target-kl", "spo", "avec", "gigaflow+random"),
+]
+PAIRS = [
+    *((arm, network) for network in ("mlp", "small-cnn") for arm in ARMS),
+    *((arm, network) for network in ("impala-cnn", "rows together") for arm in KINDS),
+]
+FAST = [("sauna", "small-cnn")]
+
+
+@pytest.mark.parametrize(
+    "arm, network",
+    [pair if pair in FAST else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
+)
+def test_every_rule_learns_with_every_network(arm: str, network: str) -> None:
+    settings = {"arm": arm, "rollout_steps": 16, "envs": 2, "epochs": 1, **NETWORKS[network]}
+    if arm == "recompute":
+        settings["epochs"] = 2
+    if arm == "random-drop":
+        settings["drop_rate"] = 0.3
+    if "dropped" in settings and arm not in ("sauna", "sauna-paper", "random-drop"):
+        del settings["dropped"]  # which only a filter reads
+    found = train_here(make_job(**settings, steps=128))
+    assert {row["arm"] for row in found.rows} == {arm} and len(found.rows) > 1
+    first, last = (found.states[min(found.states)], found.final)
+    assert all(np.isfinite(last[name]).all() for name in last if "/params/" in name)
+    assert found.rows[-1]["policy_loss"] != 0.0 and first.keys() == last.keys()
