@@ -205,8 +205,7 @@ def main() -> None:
         how = header["backend"], header["rescale"], read_wrapping(header["wrapping"])
         envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
-        asked: Layout | None = None  # of a step's actions, and of its answer
-        told: Layout | None = None
+        asked, told = Layout({}), None  # of a step's actions, and of its answer
         while True:
             blob = inbox.recv_bytes()
             is_raw = blob.startswith(Layout.RAW)

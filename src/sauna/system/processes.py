@@ -68,7 +68,7 @@ class Layout:
     RAW = b"\xff" * 8  # what a whole message begins with is the size of its header
 
     def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
-        self._kinds = {name: (a.dtype, a.shape, a.nbytes) for name, a in arrays.items()}
+        self._kinds = {name: (a.dtype, a.shape, a.nbytes) for name, a in sorted(arrays.items())}
 
     def pack(self, arrays: Mapping[str, np.ndarray]) -> bytes | None:
         """The arrays as bytes; None if one is of another type or shape than they were."""
