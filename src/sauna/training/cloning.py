@@ -97,14 +97,13 @@ def clone_members(
 
 
 def _check_kind(prepared: Prepared) -> None:
-    """Refuses a policy whose actions single observations do not explain, or of another scale.
+    """Refuses a policy that was not tried here.
 
     Raises:
       BadInput: naming the setting.
     """
     config, spaces = prepared.config, prepared.spaces
     kinds = {
-        "recurrent policies": config.recurrent != "none",
         "action masks": spaces.mask > 0,
         "pictures among other parts": bool(spaces.pictures),
         f"distribution {config.distribution}": spaces.action_kind == "continuous"
