@@ -21,6 +21,9 @@ STUDIES = (
     "pong",
     "actions-mountain-car",
     "actions-bipedal",
+    "memory",
+    "invalid-actions",
+    "picture-and-number",
 )
 CLAIMED = {  # the studies that the claims are judged by, and how the summary calls their tasks
     "fig3": "MuJoCo tasks",
@@ -38,9 +41,12 @@ TITLES = {
     "release": "The authors' training settings",
     "a2c": "A2C instead of PPO",
     "minatar": "Four MinAtar games",
+    "memory": "Two tasks that need a memory",
     "pong": "Pong, one seed",
     "actions-mountain-car": "Distributions of actions on MountainCarContinuous",
     "actions-bipedal": "Distributions of actions on BipedalWalker",
+    "invalid-actions": "Masks of invalid actions",
+    "picture-and-number": "A picture and a number together",
     "noise": "Are the dropped steps noisier?",
     "dial": "Threshold sweep: exploration against return",
     "fig5": "HalfCheetah: on its feet or on its back",
@@ -57,6 +63,13 @@ WHY = {
     "actions are drawn. All else is the preset, whose numbers were chosen for the Gaussian.",
     "actions-bipedal": "A robot that walks, in a short training: 8 environments and rollouts of "
     "512 steps, else the preset, whose numbers are RL Zoo's. `gsde` keeps its noise for 4 steps.",
+    "memory": "A cue has to be recalled nine env steps later, and a pendulum swings up whose "
+    "velocity is not observed. `mlp` has no memory; `lstm` and `gru` have a cell of width 64 "
+    "behind each trunk and learn from sequences of 32 env steps.",
+    "invalid-actions": "A knight's tour on a board of 5 x 5 squares: 25 actions, at most 8 of them "
+    "valid, and 1 for each new square. Without masks an invalid action ends the episode.",
+    "picture-and-number": "The right answer follows from a picture and a number together. Who sees "
+    "one of them alone gets 4 of 16 by chance.",
     "pong": "One seed is no comparison. It shows how far a million env steps go on Atari.",
     "noise": "The paper says that the dropped samples are noisy. The policy gradient of dropped "
     "steps was measured at five checkpoints of each seed.",

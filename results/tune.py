@@ -31,7 +31,7 @@ entropy_coef = {low = 1e-8, high = 0.1, log = true}
 value_coef = {low = 0.1, high = 2.0}
 max_grad_norm = [0.3, 0.5, 1.0, 2.0, 5.0]
 """
-SEEDS = range(5)
+SEEDS = range(3)
 EQUAL = (
     f"Pendulum-v1 {START} --envs 4 --rollout-steps 128 --minibatches 4 --epochs 5 --steps 4e4 "
     "--trials 8 --finalists 1 --fresh-seeds 0 --space runs/traced.toml"
@@ -40,6 +40,7 @@ KINDS = {
     "population": "--population-based --exchange-every 4096",
     "random": "--search random --pruner none --lockstep 8",
 }
+OF_ROWS = ("label", "seeds", "failed", "final_mean", "final_std", "env_steps")
 KEPT = ("number", "state", "return", "env_steps", "searched", "error")
 
 
@@ -54,12 +55,13 @@ def commands() -> dict[str, str]:
 
 def collect() -> dict[str, Any]:
     """Reads what the folders under runs/ hold, found by their settings."""
-    stored = [json.loads(path.read_text()) for path in Path("runs").glob("tune_*/results.json")]
-    searches, equal = {}, {kind: {} for kind in KINDS}
-    for found in stored:
+    searches: dict[str, Any] = {}
+    equal: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
+    for path in Path("runs").glob("tune_*/results.json"):
+        found = json.loads(path.read_text())
         plan = found["tune"]
         if "rollout_steps" in plan["values"]:
-            searches[found["env"]] = search(found)
+            searches[found["env"]] = search(found, path.parent)
         else:
             kind = "population" if plan["exchange_every"] else "random"
             equal[kind][str(plan["seeds"][0])] = {
@@ -70,21 +72,30 @@ def collect() -> dict[str, Any]:
     return {"commands": commands(), "searches": searches, "equal_steps": equal}
 
 
-def search(found: dict[str, Any]) -> dict[str, Any]:
-    """Keeps of a search what the page shows, and the table of trials."""
+def search(found: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Keeps of a search what the page shows, and the table of trials.
+
+    Before there were finalists, the trial of the highest score was tried on the fresh seeds.
+    """
+    earlier = [
+        row
+        for path in folder.glob("fresh_*/summary.json")
+        if path.parent.name not in found["fresh"].get("report", "")
+        for row in json.loads(path.read_text())["table"]
+        if row["label"] == "tuned"
+    ]
     kept = ("metric", "steps", "env_steps", "importance", "fresh_seeds", "verdict", "versions")
     tables = {
-        name: [
-            {key: row[key] for key in ("label", "seeds", "failed", "final_mean", "final_std")}
-            for row in found[name].get("table", [])
-        ]
+        name: [{key: row[key] for key in OF_ROWS} for row in found[name].get("table", [])]
         for name in ("finalists", "fresh")
     }
+    highest = [{key: row[key] for key in OF_ROWS} for row in earlier]
     return {
         **{name: found[name] for name in kept},
         "best": found["best"] and found["best"]["number"],
         "settings": found["best"] and found["best"]["settings"],
         **tables,
+        "highest_score_on_fresh_seeds": highest,
         "verdicts": [verdict["text"] for verdict in found["fresh"].get("verdicts", [])],
         "trials": [{key: t[key] for key in KEPT if key in t} for t in found["trials"]],
     }

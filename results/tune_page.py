@@ -33,16 +33,21 @@ def _search(env: str, search: Mapping[str, Any], command: str) -> str:
         f"{steps['trials']:,} env steps of trials, {steps['fresh']:,} on further seeds.",
         f"The first trial, from the poor start, returned {start['return']:.0f};",
         f"trial {best['number']}, which the finalists' seeds chose, {best['return']:.0f}.",
-        f"On fresh seeds: {search['verdict']['text']}.",
+        f"{search['verdict']['text'].capitalize()}.",
     ]
     return " ".join(parts)
 
 
 def _fresh(search: Mapping[str, Any]) -> str:
-    rows = ["| On the fresh seeds | seeds | final return, mean ± std |", "|---|---|---|"]
+    rows = ["| On the fresh seeds | seeds | env steps | final return, mean ± std |"]
+    rows.append("|---|---|---|---|")
     for row in search["fresh"]:
         value = f"{row['final_mean']:.0f} ± {row['final_std']:.0f}"
-        rows.append(f"| {row['label']} | {row['seeds']} | {value} |")
+        rows.append(f"| {row['label']} | {row['seeds']} | {row['env_steps']:,.0f} | {value} |")
+    for row in search["highest_score_on_fresh_seeds"]:
+        value = f"{row['final_mean']:.0f} ± {row['final_std']:.0f}"
+        label = "the trial of the highest score, which the finalists' seeds did not choose"
+        rows.append(f"| {label} | {row['seeds']} | {row['env_steps']:,.0f} | {value} |")
     return "\n".join(rows) + "\n\n" + "\n".join(f"- {text}" for text in search["verdicts"])
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 import sauna
-from helpers import SMALL, equal, make_job, own, train_here
+from helpers import SMALL, environment, equal, make_job, own, train_here
 from sauna.config.presets import resolve, resolve_run
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
@@ -83,7 +85,13 @@ def test_off_is_off_for_the_reference_options_too() -> None:
 
 
 def test_arms_that_differ_in_traced_values_share_a_program() -> None:
-    """Each trains as it would alone."""
+    """Each trains as it would alone, by the compiler's usual options: `make test` has others."""
+    check = "from algorithm.test_population import check_arms; check_arms()"
+    usual = {**environment(), "XLA_FLAGS": ""}
+    subprocess.run([sys.executable, "-c", check], env=usual, check=True)
+
+
+def check_arms() -> None:
     common = {"steps": 256, "envs": 2}
     together = train_here(
         make_job(WORLD, arm="ppo,vex-head,sauna", seeds=2, threshold=0.9, **common)

@@ -16,7 +16,10 @@ SEEDS = [(0, 0), (0, 1), (3, 0)]
 LIMIT = 0.2095  # of CartPole's angle, in rad: 12 degrees
 
 
-@pytest.mark.parametrize("env", ["make_vec/CartPole-v1", "envpool/CartPole-v1"])
+@pytest.mark.parametrize(
+    "env",
+    ["make_vec/CartPole-v1", pytest.param("envpool/CartPole-v1", marks=pytest.mark.slow)],
+)
 def test_cartpole_in_rows_ends_beyond_its_limits_and_counts_its_steps(env: str) -> None:
     """Both reset in the step after an end; what had been reached is beyond the angle's limit."""
     if env.startswith("envpool"):

@@ -139,6 +139,11 @@ def test_folders_are_made_here_or_where_the_user_said() -> None:
         "experiments/study/existing.py",
         "experiments/study/report.py",
         "experiments/study/execute/ray_files.py",  # inside a unit that this study locked
+        "experiments/tune/command.py",  # --out
+        "experiments/share/export.py",  # --to
+        "experiments/share/exchange.py",  # inside a new folder of a temporary name
+        "system/hub.py",  # where the user said
+        "training/data/minari_sets.py",  # --to minari:
     }
 
 

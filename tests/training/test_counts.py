@@ -160,7 +160,7 @@ PER_STEP = {
     "_all_finite": 1,
     "_see_and_normalize": 1,
     "act": 1,
-    "empty_like": 1,
+    "empty": 1,
     "<lambda>": 2,
     "step": 2,
     "evaluate": 1,

@@ -111,7 +111,8 @@ def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any
     envs = SteppedHere(env, N, keys.env, config.reset == "cached")
     host = HostCollector(program, job.spaces, envs, [keys])
     host.start()
-    parts = Collecting(config, env, program.policy, program.filter, lambda x: x)
+    how = program.policy, program.filter, lambda x: x, job.spaces.normalized
+    parts = Collecting(config, env, *how)
     state = start(parts, keys.env)
     step = jax.jit(lambda *arguments: collect(parts, *arguments))
     limit = min(100, capacity(config))

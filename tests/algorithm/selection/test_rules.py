@@ -237,7 +237,7 @@ def test_no_other_set_of_segments_varies_more(seed: int) -> None:
     [
         ("continuous", (2,), gaussian(2)),
         ("squashed", (2,), squashed(2)),
-        ("beta", (2,), beta(2)),
+        pytest.param("beta", (2,), beta(2), marks=pytest.mark.slow),
         ("discrete", (3,), multi_categorical((3,))),
         ("multi_discrete", (3, 2), multi_categorical((3, 2))),
         ("multi_binary", (3,), bernoulli(3)),

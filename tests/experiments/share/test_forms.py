@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import flax.linen as nn
 import jax
 import numpy as np
 import pytest
@@ -22,12 +23,14 @@ from safetensors.numpy import save
 from helpers import configured
 from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments
+from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import Config
+from sauna.envs.masked import MaskedSpace
 from sauna.envs.spaces import describe
 from sauna.experiments.share.graph import Graph
 from sauna.experiments.share.numpy_file import to_numpy
 from sauna.experiments.share.onnx_file import to_onnx
-from sauna.experiments.share.policy_graph import policy_graph
+from sauna.experiments.share.policy_graph import _activated, policy_graph
 from sauna.experiments.share.same import check_same, numpy_policy, onnx_policy
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training.loop.member_state import named_params
@@ -56,6 +59,22 @@ KINDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     ),
     "squashed": (BOX, FINITE, {"distribution": "squashed", "rescale_actions": True}),
     "beta": (BOX, FINITE, {"distribution": "beta", "rescale_actions": True}),
+    "gelu, layer norm": (
+        BOX,
+        FINITE,
+        {"hidden": (8,), "activation": "gelu", "layer_norm": True},
+    ),
+    "masked": (
+        MaskedSpace(BOX, gym.MultiDiscrete([2, 4])),
+        gym.MultiDiscrete([2, 4]),
+        {"normalize": True, "action_mask": True},
+    ),
+    "lstm": (BOX, FINITE, {"recurrent": "lstm", "recurrent_width": 4, "normalize": True}),
+    "gru": (
+        gym.Discrete(4),
+        gym.Discrete(3),
+        {"recurrent": "gru", "recurrent_width": 4, "trunk": "shared"},
+    ),
     "one choice": (gym.Discrete(4), gym.Discrete(3, start=2), {"hidden": (8,)}),
     "nested, choices": (NESTED, gym.MultiDiscrete([2, 4]), {"normalize": True}),
     "bits": (gym.MultiDiscrete([3, 2]), gym.MultiBinary(3), {}),
@@ -84,7 +103,7 @@ def made(config: Config, observed: Any, acted: Any) -> tuple[FrozenPolicy, Graph
     params = 0.3 * random.standard_normal(size).astype(np.float32)
     moments = None
     if config.normalize_observations:
-        length = spaces.observation_shape
+        length = spaces.normalized
         variance = random.uniform(0.1, 3, length)
         moments = Moments(random.standard_normal(length), variance, np.ones(1))
     policy.load(params, moments)
@@ -113,16 +132,28 @@ def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
     policy, graph, space = policy_of(kind)
     act, seen = numpy_file(graph, tmp_path), sampled(space, number_of(kind))
     check_same("numpy", policy, act, seen)
-    one = act(seen[0])
-    np.testing.assert_allclose(one, policy(seen[0]), rtol=1e-5, atol=1e-5)
-    assert np.shape(one) == np.shape(policy(seen[0]))
+    policy.reset()
+    one = numpy_policy(tmp_path / "policy.py", graph)(seen[0])
+    expected = policy(seen[0])
+    np.testing.assert_allclose(one, expected, rtol=1e-5, atol=1e-5)
+    assert np.shape(one) == np.shape(expected)
     assert len((tmp_path / "policy.py").read_text().splitlines()) <= 60
 
 
 def numpy_file(graph: Graph, folder: Path) -> Callable[[Any], Any]:
     (folder / "policy.safetensors").write_bytes(save(graph.constants))
     (folder / "policy.py").write_text(to_numpy(graph, "A policy."))
-    return numpy_policy(folder / "policy.py")
+    return numpy_policy(folder / "policy.py", graph)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_each_activation_is_flaxs(name: str, tmp_path: Path) -> None:
+    graph, x = Graph(), np.linspace(-4, 4, 81, dtype=np.float32)[:, None]
+    graph.input("observation", (), (1,), np.float32)
+    graph.output("action", _activated(graph, "observation", name), (1,), np.float32)
+    np.testing.assert_allclose(
+        numpy_file(graph, tmp_path)(x), getattr(nn, name)(x), rtol=1e-5, atol=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -130,9 +161,9 @@ def numpy_file(graph: Graph, folder: Path) -> Callable[[Any], Any]:
 def test_onnx_acts_as_the_policy(kind: str) -> None:
     pytest.importorskip("onnxruntime", reason="needs `pip install 'sauna-rl[onnx]'`")
     policy, graph, space = policy_of(kind)
-    act = onnx_policy(to_onnx(graph, kind), graph)
-    check_same("onnx", policy, act, sampled(space, number_of(kind)))
-    check_same("onnx", policy, act, sampled(space, 1))
+    for number in (number_of(kind), 1):
+        act = onnx_policy(to_onnx(graph, kind), graph)
+        check_same("onnx", policy, act, sampled(space, number))
 
 
 def test_a_form_that_acts_otherwise_is_refused(tmp_path: Path) -> None:

@@ -268,6 +268,8 @@ def test_the_fresh_seeds_compare_with_the_preset_that_the_task_has_by_itself() -
         (["A-v0", "--space", "none.toml"], "no file none.toml"),
         (["A-v0", "--on", "ray"], "on: a tuning trains on this machine"),
         (["CartPole-v1", "--arm", "ppo,sauna"], "arm: a tuning has one arm"),
+        (["CartPole-v1", "--init-from", "runs/x"], "init_from: not read by a tuning"),
+        (["CartPole-v1", "--stop", "none:such"], "stop: "),
         (["CartPole-v1", "--tirals", "3"], "unknown argument"),
     ],
 )

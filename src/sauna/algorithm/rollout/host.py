@@ -223,21 +223,23 @@ class HostCollector:
         shape, active, width = self._shape, acting.reshape(-1), self._spaces.action_width
         observations = self._observed
         self._memory.acting = acting
+        waits, bounded = self._envs.waiting is not None, policy.distribution.bounded
         actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
-            if self._envs.waiting is not None:
+            if waits:
                 self._memory.acting = acting & ~self._waiting()
+                self._note_idle(row, acting)
             own = noise[row % block // policy.hold]
             actions[row] = action = actor.act(observations[row], own)
-            self._note_idle(row, acting)
-            shown = to_env(policy.distribution, action)
+            shown = to_env(policy.distribution, action) if bounded else action
             step = self._envs.step(shown.reshape(-1, width), active)
             rewards[row] = step.reward.reshape(shape)
             seen = step.observation.reshape(seen.shape)
             if moments is None:
                 observations[row + 1] = seen
             else:
-                moments.see_and_normalize(seen, acting & ~self._waiting(), observations[row + 1])
+                there = acting & ~self._waiting() if waits else acting
+                moments.see_and_normalize(seen, there, observations[row + 1])
             if step.ended:
                 self._note_ends(params, step, row, acting, final_values)
         self.state.observation[:] = seen

@@ -202,7 +202,7 @@ def _forms(
         (folder / "numpy").mkdir()
         write_durably(folder / "numpy" / STATE, save(graph.constants))
         write_durably(folder / "numpy" / "policy.py", to_numpy(graph, title).encode())
-        check_same("numpy", policy, numpy_policy(folder / "numpy" / "policy.py"), seen)
+        check_same("numpy", policy, numpy_policy(folder / "numpy" / "policy.py", graph), seen)
 
 
 @contextmanager

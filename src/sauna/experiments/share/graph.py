@@ -17,12 +17,14 @@ class Input(NamedTuple):
       keys: where it stands in a Dict or Tuple, `("arm", "angles")`; empty: the whole observation.
       shape: of one, without the batch axis.
       dtype: of numpy, as the environment's space has it.
+      argument: what it is a part of: `observation`, `action_mask` or `state`.
     """
 
     name: str
     keys: tuple[Any, ...]
     shape: tuple[int, ...]
     dtype: str
+    argument: str = "observation"
 
 
 class Node(NamedTuple):
@@ -52,10 +54,22 @@ class Graph:
         self.nodes: list[Node] = []
         self.outputs: list[Output] = []
 
-    def input(self, name: str, keys: tuple[Any, ...], shape: tuple[int, ...], dtype: Any) -> str:
-        """Adds an array that the environment gives; returns its name."""
-        self.inputs.append(Input(name, keys, shape, np.dtype(dtype).name))
+    def input(
+        self,
+        name: str,
+        keys: tuple[Any, ...],
+        shape: tuple[int, ...],
+        dtype: Any,
+        argument: str = "observation",
+    ) -> str:
+        """Adds an array that the caller gives; returns its name."""
+        self.inputs.append(Input(name, keys, shape, np.dtype(dtype).name, argument))
         return name
+
+    @property
+    def arguments(self) -> list[str]:
+        """What the caller gives, in order: the observation, a mask, a state."""
+        return list(dict.fromkeys(part.argument for part in self.inputs))
 
     def constant(self, name: str, array: Any) -> str:
         """Adds a constant array under a name that no other one has; returns the name."""

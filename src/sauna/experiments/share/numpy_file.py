@@ -16,19 +16,24 @@ OPERATIONS = {
     "Cast": "{0}.astype(np.{to})",
     "Conv": "conv({0}, {1}, {2}, ({strides}))",
     "Div": "{0} / {1}",
+    "Exp": "np.exp({0})",
     "Equal": "{0} == {1}",
     "Gemm": "{0} @ {1} + {2}",
     "Greater": "{0} > {1}",
+    "LayerNormalization": "norm({0}, {1}, {2}, {epsilon})",
+    "MatMul": "{0} @ {1}",
     "Max": "np.maximum({0}, {1})",
     "Min": "np.minimum({0}, {1})",
     "Mul": "{0} * {1}",
     "Relu": "np.maximum({0}, 0)",
     "Reshape": "{0}.reshape(-1, {shape})",
+    "Sigmoid": "0.5 + 0.5 * np.tanh(0.5 * ({0}))",
     "Slice": "{0}[..., {start}:{end}]",
     "Softplus": "np.logaddexp({0}, 0)",
     "Sub": "{0} - {1}",
     "Tanh": "np.tanh({0})",
     "Transpose": "{0}.transpose({perm})",
+    "Where": "np.where({0}, {1}, {2})",
 }
 HELPERS = {
     "Conv": '''
@@ -40,11 +45,18 @@ def conv(x, kernel, bias, strides):
     return (products + bias).transpose(0, 3, 1, 2)
 
 ''',
+    "LayerNormalization": '''
+def norm(x, scale, bias, epsilon):
+    """x [B, D] by the mean and the variance of each row, then scaled and shifted."""
+    mean, variance = x.mean(-1, keepdims=True), x.var(-1, keepdims=True)
+    return (x - mean) / np.sqrt(variance + epsilon) * scale + bias
+
+''',
 }
 TEMPLATE = '''"""{title}
 
-act(observation) gives the most likely action. Needs numpy and safetensors; the numbers are in
-policy.safetensors, beside this file.
+act({arguments}) gives the most likely action{and_state}.
+Needs numpy and safetensors; the numbers are in policy.safetensors, beside this file.
 """
 
 from pathlib import Path
@@ -55,7 +67,7 @@ from safetensors.numpy import load_file
 W = load_file(Path(__file__).with_name("policy.safetensors"))
 
 {helpers}
-def act(observation):
+def act({signature}):
     """The action for one observation, or the actions for a batch (one more axis in front)."""
 {lines}
 '''
@@ -64,22 +76,34 @@ def act(observation):
 def to_numpy(graph: Graph, title: str) -> str:
     """Writes the file; the graph's constants are what has to stand in `policy.safetensors`."""
     helpers = "".join(text for op, text in HELPERS.items() if op in {n.op for n in graph.nodes})
-    first, (output,) = graph.inputs[0], graph.outputs
+    first, (action, *state) = graph.inputs[0], graph.outputs
     lines = [f"is_one = np.ndim({_place(first)}) == {len(first.shape)}"]
-    lines += [f"{i.name} = {_read(i)}" for i in graph.inputs]
+    lines += [f"{i.name} = {_read(i, first)}" for i in graph.inputs]
     lines += _assignments(graph)
-    lines.append(f"return {output.value}[0] if is_one else {output.value}")
+    answer = f"{action.value}[0] if is_one else {action.value}"
+    lines.append(f"return ({answer}), {state[0].value}" if state else f"return {answer}")
+    given = ", ".join(graph.arguments)
     text = "\n".join(f"    {line}" for line in lines)
     title = "".join(c if c.isalnum() or c in " -_.,:/+" else "_" for c in title)  # it ends no text
-    return TEMPLATE.format(title=title, helpers=helpers, lines=text)
+    return TEMPLATE.format(
+        title=title,
+        arguments=given,
+        signature=given.replace("state", "state=None"),
+        and_state=" and the state; at an episode's start give none" * bool(state),
+        helpers=helpers,
+        lines=text,
+    )
 
 
 def _place(given: Input) -> str:
-    return "observation" + "".join(f"[{key!r}]" for key in given.keys)
+    return given.argument + "".join(f"[{key!r}]" for key in given.keys)
 
 
-def _read(given: Input) -> str:
+def _read(given: Input, first: Input) -> str:
     shape = ", ".join(map(str, (-1, *given.shape)))
+    if given.argument == "state":
+        zeros = f"np.zeros((len({first.name}), {given.shape[0]}), np.float32)"
+        return f"{zeros} if state is None else state"
     return f"np.asarray({_place(given)}, np.{given.dtype}).reshape({shape})"
 
 

@@ -70,6 +70,8 @@ def _node(node: Node, graph: Graph, shapes: list[Any]) -> Any:
     elif node.op == "Slice":
         for one in (attributes.pop("start"), attributes.pop("end"), -1):
             further([one])
+    elif node.op == "LayerNormalization":
+        attributes["axis"] = -1
     elif node.op == "ArgMax":
         attributes = {"axis": -1, "keepdims": 1}
     elif node.op == "Concat":

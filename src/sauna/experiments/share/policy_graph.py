@@ -13,15 +13,21 @@ import numpy as np
 
 from sauna.algorithm.policy.convolutions import LAYERS
 from sauna.algorithm.policy.normalize import EPSILON
+from sauna.algorithm.policy.observation import INVALID
+from sauna.algorithm.policy.recurrent import STATES
 from sauna.config.choices import BOUNDED
 from sauna.config.settings import Config
+from sauna.envs.shapes import mask_in
 from sauna.envs.spaces import Spaces, describe, stretch
 from sauna.experiments.share.graph import Graph
 from sauna.system.errors import BadInput
 
 Arrays = Mapping[str, np.ndarray]
 NETWORKS = ("mlp", "nature-cnn")
-ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu"}
+ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu", "sigmoid": "Sigmoid"}  # of one operation
+COMPOSED = ("elu", "gelu", "leaky_relu", "selu", "silu", "swish")
+SELU = 1.0507009873554805, 1.6732632423543772  # scale and alpha (Klambauer et al. 2017)
+NORM_EPSILON = 1e-6  # of flax's LayerNorm
 
 
 def policy_graph(
@@ -36,6 +42,7 @@ def policy_graph(
     Raises:
       BadInput: the policy is of a kind that cannot be exported.
     """
+    mask, observation_space = mask_in(observation_space)
     graph, spaces = Graph(), describe(observation_space, action_space)
     _check(config, spaces)
     if spaces.observation_kind == "image":
@@ -50,10 +57,21 @@ def policy_graph(
         features = _mlp(graph, arrays, seen, trunk, config)
     else:
         features = _nature_cnn(graph, arrays, seen, trunk)
+    state = ""
+    if config.recurrent != "none":
+        cell = "cell" if config.trunk == "shared" else "policy_cell"
+        features, state = {"lstm": _lstm, "gru": _gru}[config.recurrent](
+            graph, arrays, features, cell, config.recurrent_width
+        )
     parameters = _dense(graph, arrays, features, "policy_head")
+    if mask:
+        parameters = _valid(graph, parameters, mask)
     if spaces.action_kind == "continuous" and config.distribution in BOUNDED:
         parameters = _bounded(graph, config.distribution, spaces.action_width, parameters)
     _action(graph, spaces, action_space, parameters, config.rescale_actions)
+    if state:
+        size = STATES[config.recurrent] * config.recurrent_width
+        graph.output("next_state", state, (size,), np.float32)
     return graph
 
 
@@ -66,16 +84,12 @@ def _check(config: Config, spaces: Spaces) -> None:
     unknown = ""
     if config.network not in NETWORKS:
         unknown = f"network {config.network}; only {' and '.join(NETWORKS)} are"
-    elif config.recurrent != "none":
+    elif config.recurrent not in ("none", *STATES):
         unknown = f"recurrent {config.recurrent}"
-    elif config.network == "mlp" and config.activation not in ACTIVATIONS:
+    elif config.network == "mlp" and config.activation not in (*ACTIVATIONS, *COMPOSED):
         unknown = f"activation {config.activation}"
-    elif config.network == "mlp" and config.layer_norm:
-        unknown = "layer_norm"
     elif spaces.observation_kind not in ("vector", "one_hot", "image"):
         unknown = f"observations of kind {spaces.observation_kind}"
-    elif config.action_mask:
-        unknown = "action_mask"
     elif spaces.pictures:
         unknown = "pictures beside other observations"
     if unknown:
@@ -179,10 +193,95 @@ def _dense(graph: Graph, arrays: Arrays, x: str, name: str) -> str:
 
 def _mlp(graph: Graph, arrays: Arrays, x: str, trunk: str, config: Config) -> str:
     for i in range(len(config.hidden)):
-        x = graph.add(
-            ACTIVATIONS[config.activation], _dense(graph, arrays, x, f"{trunk}/layer_{i}")
-        )
+        x = _dense(graph, arrays, x, f"{trunk}/layer_{i}")
+        if config.layer_norm:
+            name = f"{trunk}/norm_{i}"
+            parts = [
+                graph.constant(f"{name}/{part}", arrays[f"params/{name}/{part}"])
+                for part in ("scale", "bias")
+            ]
+            x = graph.add("LayerNormalization", x, *parts, epsilon=NORM_EPSILON)
+        x = _activated(graph, x, config.activation)
     return x
+
+
+def _activated(graph: Graph, x: str, activation: str) -> str:
+    """One of `choices.ACTIVATIONS`, as flax has it."""
+    if activation in ACTIVATIONS:
+        return graph.add(ACTIVATIONS[activation], x)
+    if activation in ("silu", "swish"):
+        return graph.add("Mul", x, graph.add("Sigmoid", x))
+    if activation == "leaky_relu":
+        return graph.add("Max", x, graph.add("Mul", x, _number(graph, 0.01)))
+    if activation == "gelu":  # in its form with a tanh
+        cube = graph.add("Mul", graph.add("Mul", x, x), x)
+        inner = graph.add("Add", x, graph.add("Mul", cube, _number(graph, 0.044715)))
+        inner = graph.add("Tanh", graph.add("Mul", inner, _number(graph, (2 / np.pi) ** 0.5)))
+        half = graph.add("Mul", x, _number(graph, 0.5))
+        return graph.add("Mul", half, graph.add("Add", inner, _number(graph, 1.0)))
+    scale, alpha = SELU if activation == "selu" else (1.0, 1.0)
+    zero = _number(graph, 0.0)
+    below = graph.add("Sub", graph.add("Exp", graph.add("Min", x, zero)), _number(graph, 1.0))
+    below = graph.add("Mul", below, _number(graph, alpha))
+    x = graph.add("Add", graph.add("Max", x, zero), below)
+    return graph.add("Mul", x, _number(graph, scale))
+
+
+def _number(graph: Graph, value: float) -> str:
+    """A float32 constant, named by its value."""
+    name = f"number/{value:g}"
+    if name not in graph.constants:
+        graph.constant(name, np.float32(value))
+    return name
+
+
+def _recurrent_products(
+    graph: Graph, arrays: Arrays, x: str, cell: str, size: int, first: int
+) -> tuple[str, str, str]:
+    """The cell's products of its input and of h, and the state `[B, size]`; h begins at `first`."""
+    state = graph.input("state", (), (size,), np.float32, "state")
+    h = graph.add("Slice", state, start=first, end=size) if first else state
+    kernel = graph.constant(f"{cell}/recurrent_kernel", arrays[f"params/{cell}/recurrent_kernel"])
+    return _dense(graph, arrays, x, f"{cell}/input"), graph.add("MatMul", h, kernel), state
+
+
+def _gates(graph: Graph, x: str, width: int, number: int) -> list[str]:
+    return [graph.add("Slice", x, start=i * width, end=(i + 1) * width) for i in range(number)]
+
+
+def _lstm(graph: Graph, arrays: Arrays, x: str, cell: str, width: int) -> tuple[str, str]:
+    """h `[B, width]` after a step, and the state c beside h; see `recurrent.LSTM`."""
+    inputs, of_h, state = _recurrent_products(graph, arrays, x, cell, 2 * width, width)
+    i, f, g, o = _gates(graph, graph.add("Add", inputs, of_h), width, 4)
+    kept = graph.add("Slice", state, start=0, end=width)
+    kept = graph.add("Mul", graph.add("Sigmoid", f), kept)
+    new = graph.add("Mul", graph.add("Sigmoid", i), graph.add("Tanh", g))
+    c = graph.add("Add", kept, new)
+    h = graph.add("Mul", graph.add("Sigmoid", o), graph.add("Tanh", c))
+    return h, graph.add("Concat", c, h)
+
+
+def _gru(graph: Graph, arrays: Arrays, x: str, cell: str, width: int) -> tuple[str, str]:
+    """h `[B, width]` after a step, which is the state; see `recurrent.GRU`."""
+    inputs, of_h, state = _recurrent_products(graph, arrays, x, cell, width, 0)
+    r, z, n = _gates(graph, inputs, width, 3)
+    of_r, of_z, of_n = _gates(graph, of_h, width, 3)
+    z = graph.add("Sigmoid", graph.add("Add", z, of_z))
+    bias = graph.constant(f"{cell}/recurrent_bias", arrays[f"params/{cell}/recurrent_bias"])
+    reset = graph.add("Sigmoid", graph.add("Add", r, of_r))
+    old = graph.add("Mul", reset, graph.add("Add", of_n, bias))
+    n = graph.add("Tanh", graph.add("Add", n, old))
+    rest = graph.add("Mul", graph.add("Sub", _number(graph, 1.0), z), n)
+    h = graph.add("Add", rest, graph.add("Mul", z, state))
+    return h, h
+
+
+def _valid(graph: Graph, logits: str, mask: int) -> str:
+    """The logits with those of masked actions at `INVALID`."""
+    given = graph.input("action_mask", (), (mask,), np.int8, "action_mask")
+    is_valid = graph.add("Greater", graph.add("Cast", given, to="float32"), _number(graph, 0.0))
+    invalid = graph.constant("mask/invalid", np.float32(INVALID))
+    return graph.add("Where", is_valid, logits, invalid)
 
 
 def _nature_cnn(graph: Graph, arrays: Arrays, x: str, trunk: str) -> str:

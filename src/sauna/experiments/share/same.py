@@ -53,8 +53,13 @@ def check_same(what: str, policy: Act, other: Act, seen: Sequence[Any]) -> None:
     Raises:
       SaunaError: with the largest difference.
     """
-    batch = stacked(seen)
-    expected, got = np.asarray(policy(batch)), np.asarray(other(batch))
+    if hasattr(policy, "reset"):
+        policy.reset()
+    for batch in (stacked(seen), stacked(seen[::-1])):  # of a recurrent policy two steps
+        _check_batch(what, np.asarray(policy(batch)), np.asarray(other(batch)))
+
+
+def _check_batch(what: str, expected: np.ndarray, got: np.ndarray) -> None:
     if expected.shape != got.shape or expected.dtype != got.dtype:
         raise SaunaError(
             f"{what}: its actions are {got.dtype}{list(got.shape)}, the policy's "
@@ -77,22 +82,48 @@ def onnx_policy(blob: bytes, graph: Graph) -> Act:
         raise BadInput(f"onnx: {error}; pip install 'sauna-rl[onnx]'") from error
     session = InferenceSession(blob, providers=["CPUExecutionProvider"])
 
-    def act(observation: Any) -> Any:
-        given = {}
-        for part in graph.inputs:
-            value = observation
-            for key in part.keys:
-                value = value[key]
-            given[part.name] = np.asarray(value, part.dtype)
-        return session.run(None, given)[0]
-
-    return act
+    return _Remembering(graph, lambda given: session.run(None, given)).act
 
 
-def numpy_policy(path: Path) -> Act:
-    """The function `act` of a file that `numpy_file` wrote just now."""
+def numpy_policy(path: Path, graph: Graph) -> Act:
+    """The function `act` of a file that `numpy_file` wrote just now, with the state remembered."""
     spec = importlib.util.spec_from_file_location("exported_policy", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.act
+    is_masked, has_state = ("action_mask" in graph.arguments, "state" in graph.arguments)
+    state: Any = None
+
+    def act(observation: Any) -> Any:
+        nonlocal state
+        masks = [observation["action_mask"]] if is_masked else []
+        inner = observation["observation"] if is_masked else observation
+        if not has_state:
+            return module.act(inner, *masks)
+        action, state = module.act(inner, *masks, state=state)
+        return action
+
+    return act
+
+
+class _Remembering:
+    """A model as a function of a batch of observations, which gets its last state back."""
+
+    def __init__(self, graph: Graph, run: Callable[[dict[str, Any]], list[Any]]) -> None:
+        self._graph, self._run, self._state = graph, run, None
+
+    def act(self, observation: Any) -> Any:
+        inner, mask = observation, None
+        if "action_mask" in self._graph.arguments:
+            inner, mask = observation["observation"], observation["action_mask"]
+        given: dict[str, Any] = {}
+        for part in self._graph.inputs:
+            value = {"observation": inner, "action_mask": mask, "state": self._state}[part.argument]
+            for key in part.keys:
+                value = value[key]
+            if value is None:  # the state at an episode's start
+                value = np.zeros((len(next(iter(given.values()))), *part.shape))
+            given[part.name] = np.asarray(value, part.dtype)
+        action, *state = self._run(given)
+        self._state = state[0] if state else None
+        return action

@@ -14,7 +14,7 @@ from sauna.experiments.study.units import digest_of
 from sauna.experiments.tune.space import GROUPS, Space, default_space, read_space, traced
 from sauna.system.errors import BadInput
 from sauna.training.pick import pick
-from sauna.training.prepare import Prepared, prepare
+from sauna.training.prepare import Prepared, check_own_parts, prepare
 
 SEARCHES = ("tpe", "random")
 PRUNERS = ("median", "hyperband", "none")
@@ -127,6 +127,9 @@ def make_plan(
     start = prepare({**settings, "seeds": list(seeds)})
     if len(start.config.arm) > 1:
         raise BadInput("arm: a tuning has one arm")
+    if start.config.init_from:
+        raise BadInput("init_from: not read by a tuning, whose trials start afresh")
+    check_own_parts(start)
     values = dict(space) if space is not None else default_space(start.config)
     if population:
         values = _of_population(values, given_space=space is not None)

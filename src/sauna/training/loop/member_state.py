@@ -207,7 +207,9 @@ def named_replay(state: TrainState) -> dict[str, np.ndarray]:
     if not isinstance(state.replay, Replay):
         return {}
     parts = {**state.replay.rollouts._asdict(), "number": state.replay.number}
-    return {f"replay/{name}": np.asarray(array) for name, array in parts.items()}
+    return {
+        f"replay/{name}": np.asarray(array) for name, array in parts.items() if array is not None
+    }
 
 
 def unpack_replay(own: Mapping[str, np.ndarray], example: TrainState) -> Any:
