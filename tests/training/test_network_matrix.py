@@ -1,4 +1,4 @@
-"""Every selection rule works with every kind of network, at toy size."""
+"""Every rule of selection works with the MLP, and rules of each kind with other networks."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ ARMS = [
     *("target-kl", "spo", "avec", "gigaflow+random"),
 ]
 PAIRS = [
-    *((arm, network) for network in ("mlp", "small-cnn") for arm in ARMS),
-    *((arm, network) for network in ("impala-cnn", "rows together") for arm in KINDS),
+    *((arm, "mlp") for arm in ARMS),
+    *((arm, "rows together") for arm in KINDS),
+    *((arm, "small-cnn") for arm in ("sauna", "gradient-norm", "merl")),
+    *((arm, "impala-cnn") for arm in ("sauna", "gradient-norm")),
 ]
 FAST = [("sauna", "small-cnn")]
 
@@ -40,7 +42,7 @@ FAST = [("sauna", "small-cnn")]
     "arm, network",
     [pair if pair in FAST else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
 )
-def test_every_rule_learns_with_every_network(arm: str, network: str) -> None:
+def test_a_rule_learns_with_a_network(arm: str, network: str) -> None:
     settings = {"arm": arm, "rollout_steps": 16, "envs": 2, "epochs": 1, **NETWORKS[network]}
     if arm == "recompute":
         settings["epochs"] = 2
