@@ -54,6 +54,10 @@ def two_always(num_envs: int) -> SyncVectorEnv:
     return same(2)
 
 
+def numbered(num_envs: int) -> Counting:
+    return Counting()
+
+
 def nameless(num_envs: int) -> SyncVectorEnv:
     env = same(num_envs)
     env.metadata = {}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import jax
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from sauna.envs.device.as_gymnasium import HostFace
 from sauna.envs.device.stacked import stacked
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.make import in_process_envs, make_env
+from sauna.envs.masked import MaskedEnv
 from sauna.envs.stacked import StackedEnv, StackedSpace
 from sauna.envs.wrapping import Wrapping, read_wrapping
 from sauna.system.errors import BadInput
@@ -34,6 +37,12 @@ def test_the_last_observations_are_one_also_at_both_ends_of_an_episode() -> None
     for _ in range(5):
         step = envs.step(np.zeros((1, 1), np.int32), np.ones(1, bool))
     assert step.final_observation.tolist() == [[4, 5]] and step.observation.tolist() == [[0, 0]]
+
+
+def test_wrapped_environments_can_be_copied() -> None:
+    for env in (StackedEnv(Finite(), 3), MaskedEnv(Finite())):
+        again = copy.deepcopy(env)
+        assert again.observation_space == env.observation_space
 
 
 def test_the_device_stacks_as_the_host_does() -> None:

@@ -34,7 +34,8 @@ class Hypers(NamedTuple):
 class Rollout(NamedTuple):
     """The full stream of one member's iteration, in time order.
 
-    Env n acted in its first `valid[:, n].sum()` rows; the rows behind are padding.
+    Env n acted in the rows where `valid[:, n]`. The others are padding behind its last step, or
+    rows in which it waited for its next episode.
     """
 
     observation: Array  # [S, N, ...] normalised float32, or uint8 images

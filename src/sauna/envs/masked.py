@@ -144,6 +144,8 @@ class MaskedEnv:
         return {OBSERVATION: observation, MASK: flat_mask(given, self.observation_space.sizes)}
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # also of a copy that is not complete yet
+            raise AttributeError(name)
         return getattr(self._env, name)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_number
 from sauna.envs.host.parallel_envs import AgentsAsOne
-from sauna.envs.host.together import group_size
+from sauna.envs.host.together import group_size, may_wait
 from sauna.envs.make import make_env
 from sauna.envs.shapes import check_shapes, mask_in
 from sauna.envs.spaces import Spaces, describe, observation_reader
@@ -25,6 +25,7 @@ class Probe(NamedTuple):
       spaces: its spaces.
       differs: None where it gave the same episode twice.
       group: rows that stand together (0: any number); None if each environment stands alone.
+      may_wait: whether a row may have to wait until its next episode begins.
       time_limit: env steps after which Gymnasium cuts an episode; None if it says no number.
     """
 
@@ -32,6 +33,7 @@ class Probe(NamedTuple):
     differs: str | None
     time_limit: int | None = None
     group: int | None = None
+    may_wait: bool = False
 
 
 def probe(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Probe:
@@ -47,7 +49,7 @@ def probe(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> P
     try:
         spaces = describe(first.observation_space, first.action_space)
         limit = getattr(getattr(first, "spec", None), "max_episode_steps", None)
-        group = group_size(first)
+        group, waits = group_size(first), may_wait(first)
         _play(first, spaces, seed=1)
         differs = _difference(_play(first, spaces, seed=2), _play(second, spaces, seed=2))
     except BadInput:
@@ -59,7 +61,7 @@ def probe(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> P
         close(second)
     if group == 0:
         differs = differs or "a vector environment cannot be brought back row by row"
-    return Probe(spaces, differs, limit if isinstance(limit, int) else None, group)
+    return Probe(spaces, differs, limit if isinstance(limit, int) else None, group, waits)
 
 
 def probe_on_device(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> Probe:

@@ -69,4 +69,6 @@ class StackedEnv:
         return self._seen.reshape(-1).copy(), *answer[1:]
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # also of a copy that is not complete yet
+            raise AttributeError(name)
         return getattr(self.env, name)

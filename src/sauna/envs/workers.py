@@ -177,11 +177,11 @@ class ProcessEnvs(HostEnvs):
 def _serve_step(envs: HostEnvs, arrays: dict[str, np.ndarray], layout: Layout | None) -> Any:
     """A step's answer, in full unless plain bytes say all of it: `(header, arrays, bytes)`."""
     step = envs.step(arrays["action"], arrays["active"])
-    told = {name: getattr(step, name) for name in ARRAYS}
+    answered = {name: getattr(step, name) for name in ARRAYS}
     if step.info or layout is None:
         header = {"kind": "answer", **({"info": [*step.info.items()]} if step.info else {})}
-        return header, told, None
-    return {"kind": "answer"}, told, layout.pack(told)
+        return header, answered, None
+    return {"kind": "answer"}, answered, layout.pack(answered)
 
 
 def _serve(envs: HostEnvs, message: Message) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -205,18 +205,18 @@ def main() -> None:
         how = header["backend"], header["rescale"], read_wrapping(header["wrapping"])
         envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
-        asked, told = Layout({}), None  # of a step's actions, and of its answer
+        requests, answers = Layout({}), None  # of a step's actions, and of its answer
         while True:
             blob = inbox.recv_bytes()
             is_raw = blob.startswith(Layout.RAW)
-            message = Message({"kind": "step"}, asked.unpack(blob)) if is_raw else decode(blob)
+            message = Message({"kind": "step"}, requests.unpack(blob)) if is_raw else decode(blob)
             if message.header["kind"] != "step":
                 send(outbox, *_serve(envs, message))
                 continue
-            asked = asked if is_raw else Layout(message.arrays)
-            answer, arrays, raw = _serve_step(envs, message.arrays, told)
+            requests = requests if is_raw else Layout(message.arrays)
+            answer, arrays, raw = _serve_step(envs, message.arrays, answers)
             if raw is None:
-                told = told or Layout(arrays)
+                answers = answers or Layout(arrays)
                 send(outbox, answer, arrays)
             else:
                 outbox.send_bytes(raw)

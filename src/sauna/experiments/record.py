@@ -15,7 +15,7 @@ from sauna.config.imported_from import names_the_folder
 from sauna.envs.host.answers import close, one_number
 from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
-from sauna.envs.wrapping import wrapping_of
+from sauna.envs.wrapping import Wrapping, wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.episodes import kwargs_of, provided, statistics
 from sauna.experiments.evaluate.play import Progress
@@ -107,7 +107,7 @@ def record(
 
     policy, played = TrainedPolicy(artifact, name, made, best), []
     progress, listener = Progress(name, episodes, say), _Listener(made)
-    with _writer(to, made, about) as add:
+    with _writer(to, made, about, wrapping_of(artifact.config)) as add:
         for i in range(episodes):
             how = deterministic, seed + i, progress.step, max_steps, policy.policy.hold
             played.append(progress.played(play(policy, listener, *how)))
@@ -118,9 +118,11 @@ def record(
     return {"to": to, **about, **found, "env_steps": sum(found["lengths"])}
 
 
-def _writer(to: str, env: Any, about: Mapping[str, Any]) -> AbstractContextManager[Add]:
+def _writer(
+    to: str, env: Any, about: Mapping[str, Any], wrapping: Wrapping
+) -> AbstractContextManager[Add]:
     if to.startswith(MINARI):
-        return minari_writer(to, env, about)
+        return minari_writer(to, env, about, wrapping)
     return parquet_writer(Path(to), env, about)
 
 

@@ -135,7 +135,7 @@ def examine(run: RunConfig, overrides: Mapping[str, Any], found: Probe | None = 
     """
     found = found or look_at(run.config)
     run = _settle(run, found.spaces)
-    _check_together(run, found.group)
+    _check_together(run, found)
     parsed = parse_all(overrides)
     check_read_here(run.config, found.spaces, parsed)
     reading = run
@@ -201,24 +201,45 @@ def check_own_parts(prepared: Prepared) -> None:
         check_plugins(prepared.config, prepared.spaces)
 
 
-def _check_together(run: RunConfig, group: int | None) -> None:
+def _check_together(run: RunConfig, found: Probe) -> None:
     """Refuses what rows that act together cannot do.
 
     Raises:
       BadInput: with the one line that says which.
     """
-    config = run.config
+    config, group = run.config, found.group
     if group is None:
         return
     if config.env_processes:
         raise BadInput(f"env_processes: not read by {config.env}, which steps its rows by itself")
-    if config.filter != "none" and config.dropped == "replace":
-        raise BadInput(
-            f"dropped: the rows of {config.env} act together, so that no env can replace a step; "
-            "give mask (--dropped mask)"
-        )
+    if group and config.recurrent != "none":
+        raise BadInput("recurrent: a policy of several agents cannot be recurrent; give none")
+    _check_filter(config, found)
     if group and config.envs % group:
         raise BadInput(f"envs: {config.envs} is no multiple of the {group} agents of {config.env}")
+
+
+def _check_filter(config: Config, found: Probe) -> None:
+    """Refuses a step filter that rows which act together cannot have.
+
+    Raises:
+      BadInput: rows may wait, or would have to replace a step.
+    """
+    if config.filter == "none" and config.gae_over != "kept":
+        return
+    without = "an arm without a filter (ppo, or a sampler)"
+    if found.may_wait and found.group:
+        raise BadInput(f"arm: a step filter cannot pass over agents that wait; give {without}")
+    if found.may_wait:
+        raise BadInput(
+            f"arm: {config.env} begins episodes in autoreset mode NEXT_STEP, and a step filter "
+            f"cannot pass over its void steps; use mode SAME_STEP, or {without}"
+        )
+    if config.dropped == "replace":
+        raise BadInput(
+            "dropped: --dropped replace needs environments that step independently, unlike "
+            f"{config.env}; give mask (--dropped mask)"
+        )
 
 
 def _network(config: Config, spaces: Spaces) -> str:

@@ -8,7 +8,7 @@ import pytest
 import vector_worlds
 from helpers import equal, make_job, resumed, train_here
 from sauna.algorithm.rollout.host import HostCollector
-from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.parallel_envs import AgentsAsOne, ParallelEnvs
 from sauna.envs.host.vector_envs import OneRow, VectorEnvs
 from sauna.envs.make import in_process_envs, make_env
@@ -77,10 +77,13 @@ def test_a_vector_environment_that_cannot_be_used_is_refused_in_a_line() -> None
         make_env("vector_worlds:nameless", {})
     for settings, words in (
         ({"env_processes": 1}, "env_processes: not read by vector_worlds:same"),
-        ({"arm": "sauna"}, "dropped: the rows of .* act together"),
+        ({"arm": "sauna"}, "dropped: --dropped replace needs"),
     ):
         with pytest.raises(BadInput, match=words):
             make_job("vector_worlds:same", **{"arm": "ppo", **settings})
+    with pytest.raises(BadInput, match="mode NEXT_STEP.*use mode SAME_STEP"):
+        make_job("vector_worlds:later", arm="sauna", dropped="mask")
+    make_job("vector_worlds:same", arm="sauna", dropped="mask")
     with pytest.raises(BadInput, match="Gymnasium knows no 'Nowhere-v0'"):
         make_env("make_vec/Nowhere-v0", {})
 
@@ -168,15 +171,19 @@ def test_agents_train_and_resume_exactly() -> None:
     assert equal(again.final, whole.final) and first.rows + again.rows == whole.rows
     lengths = {n for row in whole.rows for n in row["episode_lengths"]}
     assert lengths == {2, 3, 4} and "eval_return_mean" in whole.rows[-1]
-    masked = {"arm": "sauna", "envs": 3, "dropped": "mask", "rollout_steps": 24, "steps": 72}
-    with pytest.raises(EnvironmentFailure, match="a step filter cannot pass over that"):
-        train_here(make_job("vector_worlds:Agents", **masked))
-    kwargs = '{"together": true}'
-    assert train_here(make_job("vector_worlds:Agents", env_kwargs=kwargs, **masked)).rows
+
+
+def test_a_function_with_its_own_number_of_envs_is_a_plain_environment() -> None:
+    env = make_env("vector_worlds:numbered", {"num_envs": 3})
+    assert isinstance(env, vector_worlds.Counting)
 
 
 def test_agents_are_refused_what_they_cannot_do() -> None:
     with pytest.raises(BadInput, match="envs: 2 is no multiple of the 3 agents"):
         make_job("vector_worlds:Agents", arm="ppo", envs=2)
+    with pytest.raises(BadInput, match="recurrent: a policy of several agents"):
+        make_job("vector_worlds:Agents", arm="ppo", envs=3, recurrent="gru")
+    with pytest.raises(BadInput, match="filter cannot pass over agents that wait"):
+        make_job("vector_worlds:Agents", arm="sauna", envs=3, dropped="mask")
     with pytest.raises(BadInput, match="agent b has another observation space than a"):
         make_job("vector_worlds:Agents", arm="ppo", envs=3, env_kwargs='{"wide": true}')

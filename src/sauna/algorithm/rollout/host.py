@@ -259,7 +259,7 @@ class HostCollector:
             return
         if self._program.filter is not None or self._config.gae_over == "kept":
             raise EnvironmentFailure(
-                "an environment waits for the others' episodes to end, and a step filter cannot "
+                "an environment waits for its next episode to begin, and a step filter cannot "
                 "pass over that; train arms without one (ppo, or a sampler)"
             )
         self._idle[:, row] = acting & self._waiting()

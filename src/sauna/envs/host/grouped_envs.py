@@ -124,7 +124,12 @@ class GroupedEnvs(HostEnvs):
         for group in self._groups:
             acting = active[group.rows]
             if acting.any() and not acting.all():
-                raise self._failure(group, "its rows act together")
+                raise self._failure(
+                    group,
+                    "all rows of one "
+                    + self.kind
+                    + " must step together; some are active and some are not",
+                )
             if not acting.any():
                 continue
             try:
@@ -146,10 +151,14 @@ class GroupedEnvs(HostEnvs):
         )
 
     def snapshot(self, index: int) -> Snapshot:
-        """What all rows of a group did since its reset: one cannot be brought back alone."""
+        """What all rows of a group did since its reset, with its first row only.
+
+        None can be brought back alone.
+        """
         group = self._of(index)
-        width = (len(group.actions), group.number, self.spaces.action_width)
-        actions = np.asarray(group.actions, self.spaces.action_dtype).reshape(width)
+        taken = group.actions if index == group.rows.start else []
+        width = (len(taken), group.number, self.spaces.action_width)
+        actions = np.asarray(taken, self.spaces.action_dtype).reshape(width)
         return {"episode": np.asarray(group.episode), "actions": actions}
 
     def restore(self, index: int, snapshot: Snapshot) -> np.ndarray:

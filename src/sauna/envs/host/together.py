@@ -97,7 +97,7 @@ def plain_maker(function: Make, kwargs: dict[str, Any]) -> Make:
 
     def make(**more: Any) -> Any:
         given = {**kwargs, **more}
-        if takes_number(function):
+        if takes_number(function) and "num_envs" not in given:  # else it means its own
             made = function(num_envs=1, **given)
             if is_vector(made):
                 return OneRow(made)
@@ -133,3 +133,10 @@ def group_size(plain: Any) -> int | None:
     if isinstance(plain, OneRow):
         return 0
     return len(plain.agents) if isinstance(plain, AgentsAsOne) else None
+
+
+def may_wait(plain: Any) -> bool:
+    """Whether a row may have to wait until its next episode begins."""
+    if isinstance(plain, OneRow):
+        return plain.mode == "NEXT_STEP"
+    return isinstance(plain, AgentsAsOne)

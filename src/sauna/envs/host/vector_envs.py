@@ -176,7 +176,7 @@ class OneRow:
         self.action_space = env.single_action_space
         self.metadata, self.spec = env.metadata, getattr(env, "spec", None)
         self.render_mode = getattr(env, "render_mode", None)
-        self._mode = autoreset_mode(env)
+        self.mode = autoreset_mode(env)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -186,7 +186,7 @@ class OneRow:
         batch = batch_of(self.action_space, [action])
         observation, reward, terminated, truncated, info = self.env.step(batch)
         seen, over = self._first(observation), bool(terminated[0] or truncated[0])
-        if over and self._mode == "SAME_STEP":
+        if over and self.mode == "SAME_STEP":
             seen, info = final_of(info, 0), info.get("final_info", info)
         return seen, float(reward[0]), bool(terminated[0]), bool(truncated[0]), row_of(info, 0)
 

@@ -211,8 +211,7 @@ def moved_in_time(decisions: list[list[np.ndarray]], random: np.random.Generator
 
 def _of_envs(x: Any, rollout: Rollout) -> list[np.ndarray]:
     """The valid steps of `x` `[S, N, ...]`, for each env: `[steps, ...]`."""
-    steps = np.asarray(rollout.valid).sum(0)
-    return [np.asarray(x)[:length, n] for n, length in enumerate(steps)]
+    return [np.asarray(x)[acted, n] for n, acted in enumerate(np.asarray(rollout.valid).T)]
 
 
 def _flat(rollout: Rollout, advantage: np.ndarray, seen: np.ndarray) -> Stream:

@@ -16,6 +16,7 @@ import numpy as np
 
 from sauna.envs.shapes import one_of
 from sauna.envs.spaces import Spaces, describe, observation_reader
+from sauna.envs.wrapping import PLAIN, Wrapping
 from sauna.system.errors import BadInput, one_line
 from sauna.training.data.episodes import (
     MINARI,
@@ -41,13 +42,16 @@ def _place(text: str) -> tuple[Path, str]:
 
 
 @contextmanager
-def minari_writer(text: str, env: Any, about: Mapping[str, Any]) -> Iterator[Add]:
+def minari_writer(
+    text: str, env: Any, about: Mapping[str, Any], wrapping: Wrapping = PLAIN
+) -> Iterator[Add]:
     """A function that adds an episode to a new dataset, which is there at the end.
 
     Args:
       text: `minari:NAME`, such as `minari:cartpole/ppo-v0`, or `minari:./FOLDER/NAME`.
       env: whose spaces are read.
       about: JSON values that say how the episodes were played.
+      wrapping: what is around it. With one, no description is stored: it would tell other spaces.
 
     Raises:
       BadInput: the name is none, the dataset is there, or Minari is not.
@@ -67,7 +71,8 @@ def minari_writer(text: str, env: Any, about: Mapping[str, Any]) -> Iterator[Add
     root.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=".sauna-", dir=root))
     try:
-        yield _Writer(temporary, name, env, about).add
+        spec = _spec_of(env) if wrapping == PLAIN else None
+        yield _Writer(temporary, name, env, spec, about).add
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (temporary / name).rename(root / name)
         if namespace is not None:
@@ -100,8 +105,11 @@ def _root(path: Path) -> Iterator[None]:
 
 
 class _Writer:
-    def __init__(self, root: Path, name: str, env: Any, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self, root: Path, name: str, env: Any, spec: Any, about: Mapping[str, Any]
+    ) -> None:
         self._root, self._name, self._env, self._about = root, name, env, about
+        self._spec = spec
         self._dataset: Any = None
 
     def add(self, episode: Recorded) -> None:
@@ -124,7 +132,7 @@ class _Writer:
                 self._dataset = minari.create_dataset_from_buffers(
                     self._name,
                     [buffer],
-                    env=_spec_of(self._env),
+                    env=self._spec,
                     observation_space=self._env.observation_space,
                     action_space=self._env.action_space,
                     algorithm_name=f"SAUNA {self._about['version']}, {self._about['member']}",
