@@ -19,6 +19,7 @@ FLOORS = (
     "envs.masked",
     "envs.pictures",
     "envs.shapes",
+    "envs.flatten",
     "envs.spaces",
     "envs.stacked",
     "envs.wrapping",

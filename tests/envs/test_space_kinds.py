@@ -211,3 +211,27 @@ def test_choices_that_a_space_does_not_have_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match="its actions are none of"):
             action_reader(space)(np.array(taken))
+
+
+def test_a_prepared_reader_flattens_as_gymnasium_does() -> None:
+    space = gym.Dict(
+        {
+            "b": gym.Box(-1, 1, (2, 2), np.float32),
+            "a": gym.Tuple((gym.Discrete(3, start=-1), gym.MultiBinary((2, 2)))),
+            "c": gym.MultiDiscrete([[2, 3], [4, 2]]),
+            "d": gym.Box(0, 9, (), np.int64),
+        }
+    )
+    read = observation_reader(space)
+    for seed in range(20):
+        space.seed(seed)
+        seen = space.sample()
+        expected = gym.flatten(space, seen)
+        assert (read(seen).dtype, read(seen).tobytes()) == (expected.dtype, expected.tobytes())
+    small = gym.Dict({"x": gym.Box(-1, 1, (2,), np.float32), "n": gym.Discrete(3)})
+    read, seen = observation_reader(small), {"x": np.array([1 / 3, 0.1]), "n": 2}
+    expected = gym.flatten(small, seen)  # float64 is rounded as the space says
+    assert (read(seen).dtype, read(seen).tobytes()) == (expected.dtype, expected.tobytes())
+    for wrong in ({**seen, "n": 3}, {**seen, "x": 1}, {**seen, "x": np.zeros(3)}, {"n": 2}):
+        with pytest.raises((IndexError, ValueError)):
+            read(wrong)

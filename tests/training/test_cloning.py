@@ -136,6 +136,8 @@ def test_what_cannot_be_cloned_is_refused_in_a_line(tmp_path: Path, monkeypatch)
     fresh = {"init_normalizer": "fresh"}
     with pytest.raises(BadInput, match="fresh would show a clone what it was not fitted to"):
         initial(WORLD, **fresh)
+    with pytest.raises(BadInput, match="is not supported with distribution squashed"):
+        initial(WORLD, distribution="squashed")
     with pytest.raises(BadInput, match="clone_epochs: not read"):
         sauna.train(WORLD, out=tmp_path / "run", quiet=True, **{**SETTINGS, "init_from": "RUN"})
     assert list(tmp_path.iterdir()) == []

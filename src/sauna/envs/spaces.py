@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.envs.flatten import flattener
 from sauna.envs.pictures import (
     channels_last,
     highest_byte,
@@ -317,14 +318,14 @@ def observation_reader(space: Any) -> Callable[[Any], np.ndarray]:
         return np.asarray
 
     check = shape_check(space)
+    if isinstance(space, gym.Box):
 
-    def read(observation: Any) -> np.ndarray:
-        check(observation)
-        if isinstance(space, gym.Box):
+        def read(observation: Any) -> np.ndarray:
+            check(observation)
             return np.asarray(observation).reshape(-1)
-        return gym.flatten(space, observation)
 
-    return read
+        return read
+    return flattener(space, check)
 
 
 def _packed_reader(space: Any) -> Callable[[Any], np.ndarray]:
@@ -363,7 +364,7 @@ def action_writer(space: Any, rescale: bool = False) -> Callable[[np.ndarray], A
         return _box_writer(space, rescale)
     if isinstance(space, gym.Discrete):
         start = int(space.start)
-        return lambda action: int(action[0]) + start
+        return lambda action: action.item() + start
     if isinstance(space, gym.MultiDiscrete):
         starts = np.asarray(getattr(space, "start", 0))
         return lambda action: (action + starts).astype(space.dtype)

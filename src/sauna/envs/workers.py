@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import sys
 import time
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from sauna.envs.make import in_process_envs
 from sauna.envs.spaces import read_spaces
 from sauna.envs.wrapping import PLAIN, Wrapping, read_wrapping
 from sauna.system.errors import SaunaError, one_line
-from sauna.system.processes import Message, child_ends, receive, send, start_worker
+from sauna.system.processes import Layout, Message, child_ends, decode, receive, send, start_worker
 from sauna.system.tracebacks import cause_of, describe_failure
 
 STARTING = 120.0  # seconds that a worker may take at least to import, make and compile
@@ -65,6 +66,12 @@ class ProcessEnvs(HostEnvs):
                 )
             except BrokenPipeError:
                 pass  # named when its answer is read
+        self._polls = [select.poll() for _ in self._workers]
+        for poll, worker in zip(self._polls, self._workers, strict=True):
+            poll.register(worker.inbox.fileno(), select.POLLIN)
+        # Of a step's action and of its answer, by worker, once one was sent whole.
+        self._actions: dict[int, Layout] = {}
+        self._steps: dict[int, Layout] = {}
         answers = [self._answer(number, max(timeout, STARTING)) for number in range(processes)]
         self.spaces = read_spaces(answers[0].header["spaces"])
 
@@ -77,9 +84,11 @@ class ProcessEnvs(HostEnvs):
 
     def step(self, action: np.ndarray, active: np.ndarray) -> Step:
         for number, part in enumerate(self._parts):
-            arrays = {"action": action[part], "active": active[part]}
-            self._say(number, {"kind": "step"}, arrays)
+            rows = slice(part[0], part[-1] + 1)
+            self._ask(number, {"action": action[rows], "active": active[rows]})
         answers = [self._answer(number) for number in range(len(self._workers))]
+        for number in range(len(self._steps), len(answers)):
+            self._steps[number] = Layout(answers[number].arrays)
         parts = {name: np.concatenate([a.arrays[name] for a in answers]) for name in ARRAYS}
         ends = ("terminated", "truncated", "life_lost")
         info = {
@@ -108,6 +117,18 @@ class ProcessEnvs(HostEnvs):
         for worker in self._workers:
             worker.stop()
 
+    def _ask(self, number: int, arrays: dict[str, np.ndarray]) -> None:
+        """Sends a worker the actions of a step."""
+        blob = self._actions[number].pack(arrays) if number in self._actions else None
+        if blob is None:
+            self._actions[number] = Layout(arrays)
+            self._say(number, {"kind": "step"}, arrays)
+            return
+        try:
+            self._workers[number].outbox.send_bytes(blob)
+        except BrokenPipeError:
+            self._answer(number)
+
     def _say(
         self, number: int, header: dict[str, Any], arrays: dict[str, np.ndarray] | None = None
     ) -> None:
@@ -128,10 +149,13 @@ class ProcessEnvs(HostEnvs):
             worker.process.kill()
             raise EnvironmentFailure(f"{name} did not answer within {timeout:g} s")
         try:
-            message = receive(worker.inbox)
+            blob = worker.inbox.recv_bytes()
         except (EOFError, ConnectionResetError):
             code = worker.process.wait()
             raise EnvironmentFailure(f"{name} ended with exit code {code}") from None
+        if blob.startswith(Layout.RAW):
+            return Message({"kind": "answer"}, self._steps[number].unpack(blob))
+        message = decode(blob)
         if message.header["kind"] == "failure":
             error = EnvironmentFailure(f"{name}: {message.header['message']}")
             raise error from cause_of(message.header)
@@ -140,7 +164,8 @@ class ProcessEnvs(HostEnvs):
     def _wait_for(self, number: int, timeout: float) -> bool:
         """Whether a worker answers in time; another one's end is noticed meanwhile."""
         end = time.monotonic() + timeout
-        while not self._workers[number].inbox.poll(min(NOTICE, max(end - time.monotonic(), 0.0))):
+        poll = self._polls[number].poll
+        while not poll(1000.0 * min(NOTICE, max(end - time.monotonic(), 0.0))):
             for other, worker in enumerate(self._workers):
                 if other != number and worker.process.poll() is not None:
                     self._answer(other)  # its last words, or its exit code
@@ -149,17 +174,22 @@ class ProcessEnvs(HostEnvs):
         return True
 
 
+def _serve_step(envs: HostEnvs, arrays: dict[str, np.ndarray], layout: Layout | None) -> Any:
+    """A step's answer, in full unless plain bytes say all of it: `(header, arrays, bytes)`."""
+    step = envs.step(arrays["action"], arrays["active"])
+    told = {name: getattr(step, name) for name in ARRAYS}
+    if step.info or layout is None:
+        header = {"kind": "answer", **({"info": [*step.info.items()]} if step.info else {})}
+        return header, told, None
+    return {"kind": "answer"}, told, layout.pack(told)
+
+
 def _serve(envs: HostEnvs, message: Message) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """An answer's header and arrays."""
     header: dict[str, Any] = {"kind": "answer"}
     kind, arrays = message.header["kind"], message.arrays
     if kind == "reset":
         return header, {"observation": envs.reset()}
-    if kind == "step":
-        step = envs.step(arrays["action"], arrays["active"])
-        if step.info:
-            header["info"] = [*step.info.items()]
-        return header, {name: getattr(step, name) for name in ARRAYS}
     if kind == "snapshot":
         return header, envs.snapshot(message.header["index"])
     go_on = envs.restore if kind == "restore" else envs.start_after
@@ -175,8 +205,21 @@ def main() -> None:
         how = header["backend"], header["rescale"], read_wrapping(header["wrapping"])
         envs = in_process_envs(header["env"], header["kwargs"], seeds, *how)
         send(outbox, {"kind": "made", "spaces": list(envs.spaces)})
+        asked, told = Layout({}), None  # of a step's actions, and of its answer
         while True:
-            send(outbox, *_serve(envs, receive(inbox)))
+            blob = inbox.recv_bytes()
+            is_raw = blob.startswith(Layout.RAW)
+            message = Message({"kind": "step"}, asked.unpack(blob)) if is_raw else decode(blob)
+            if message.header["kind"] != "step":
+                send(outbox, *_serve(envs, message))
+                continue
+            asked = asked if is_raw else Layout(message.arrays)
+            answer, arrays, raw = _serve_step(envs, message.arrays, told)
+            if raw is None:
+                told = told or Layout(arrays)
+                send(outbox, answer, arrays)
+            else:
+                outbox.send_bytes(raw)
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:

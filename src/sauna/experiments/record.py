@@ -109,7 +109,7 @@ def record(
     progress, listener = Progress(name, episodes, say), _Listener(made)
     with _writer(to, made, about) as add:
         for i in range(episodes):
-            how = deterministic, seed + i, progress.step, max_steps
+            how = deterministic, seed + i, progress.step, max_steps, policy.policy.hold
             played.append(progress.played(play(policy, listener, *how)))
             add(listener.recorded(seed + i))
     progress.say_cut(max_steps)

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
@@ -57,6 +57,35 @@ def decode(blob: bytes) -> Message:
     size = int.from_bytes(blob[:8], "little")
     metadata = json.loads(blob[8 : 8 + size])["__metadata__"]
     return Message(json.loads(metadata["header"]), load(blob))
+
+
+class Layout:
+    """Arrays of known types and shapes as plain bytes, for a message that is sent very often.
+
+    Both sides make it of the arrays of a whole message.
+    """
+
+    RAW = b"\xff" * 8  # what a whole message begins with is the size of its header
+
+    def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
+        self._kinds = {name: (a.dtype, a.shape, a.nbytes) for name, a in sorted(arrays.items())}
+
+    def pack(self, arrays: Mapping[str, np.ndarray]) -> bytes | None:
+        """The arrays as bytes; None if one is of another type or shape than they were."""
+        if any(
+            (arrays[name].dtype, arrays[name].shape) != kind[:2]
+            for name, kind in self._kinds.items()
+        ):
+            return None
+        return b"".join([self.RAW, *(arrays[name].tobytes() for name in self._kinds)])
+
+    def unpack(self, blob: bytes) -> dict[str, np.ndarray]:
+        """The inverse of `pack`; the arrays may be written to."""
+        own, start, found = bytearray(blob), len(self.RAW), {}
+        for name, (dtype, shape, size) in self._kinds.items():
+            found[name] = np.frombuffer(own, dtype, size // dtype.itemsize, start).reshape(shape)
+            start += size
+        return found
 
 
 class Shared:

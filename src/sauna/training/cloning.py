@@ -63,6 +63,7 @@ def clone_members(
     """
     config = prepared.config
     name = config.init_from
+    _check_kind(prepared)
     if config.init_normalizer == "fresh" and config.normalize_observations:
         raise BadInput("init_normalizer: fresh would show a clone what it was not fitted to")
     data = _read(prepared)
@@ -93,6 +94,23 @@ def clone_members(
         "members": figures,
     }
     return arrays, origin
+
+
+def _check_kind(prepared: Prepared) -> None:
+    """Refuses a policy that was not tried here.
+
+    Raises:
+      BadInput: naming the setting.
+    """
+    config, spaces = prepared.config, prepared.spaces
+    kinds = {
+        "action masks": spaces.mask > 0,
+        "pictures among other parts": bool(spaces.pictures),
+        f"distribution {config.distribution}": spaces.action_kind == "continuous"
+        and config.distribution != "gaussian",
+    }
+    if found := [kind for kind, is_there in kinds.items() if is_there]:
+        raise BadInput(f"init_from: data:... is not supported with {found[0]}")
 
 
 def _read(prepared: Prepared) -> Demonstrations:

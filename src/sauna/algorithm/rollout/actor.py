@@ -283,7 +283,14 @@ def _sampler(config: Config, spaces: Spaces) -> Callable[[np.ndarray, np.ndarray
         return _beta_sample if config.distribution == "beta" else lambda noisy, noise: noisy
     if spaces.action_kind == "multi_binary":
         return lambda noisy, noise: (noisy > 0).astype(np.int32)
-    return lambda noisy, noise: _largest(noisy, spaces.action_sizes)
+    ends = np.cumsum(spaces.action_sizes)
+
+    def largest(noisy: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        chosen = np.empty((*noisy.shape[:-1], len(ends)), np.int32)
+        _largest(noisy, ends, chosen)
+        return chosen
+
+    return largest
 
 
 def _beta_sample(heads: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -299,10 +306,23 @@ def _noise_kind(config: Config, spaces: Spaces) -> int:
     return {"beta": APART, "gsde": MATRIX}.get(config.distribution, ADDED)
 
 
-def _largest(logits: np.ndarray, sizes: tuple[int, ...]) -> np.ndarray:
-    """The largest of each categorical's logits `[..., sum(sizes)]`: int32 `[..., len(sizes)]`."""
-    parts = np.split(logits, np.cumsum(sizes)[:-1], -1)
-    return np.stack([part.argmax(-1) for part in parts], -1).astype(np.int32)
+@compiled
+def _largest(logits: Any, ends: Any, chosen: Any) -> None:
+    """Writes the largest of each categorical's logits `[P, N, sum(sizes)]` to `[P, N, len(sizes)]`.
+
+    As `np.argmax`: of equals the first, and of numbers the first that is none.
+    """
+    for p in range(logits.shape[0]):
+        for n in range(logits.shape[1]):
+            start = 0
+            for i in range(len(ends)):
+                best = start
+                for j in range(start + 1, ends[i]):
+                    x, y = logits[p, n, j], logits[p, n, best]
+                    if x > y or (np.isnan(x) and not np.isnan(y)):
+                        best = j
+                chosen[p, n, i] = best - start
+                start = ends[i]
 
 
 def make_actor(

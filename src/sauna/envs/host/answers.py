@@ -20,6 +20,8 @@ def one_number(reward: Any) -> float:
     Raises:
       ValueError: it is several numbers, or none.
     """
+    if type(reward) is float:  # asked first: it costs least, at every env step
+        return reward
     if isinstance(reward, float | int):
         return float(reward)
     found = np.asarray(reward)
@@ -36,7 +38,7 @@ def life_lost(info: Any) -> bool:
     Raises:
       ValueError: `info` is no dict, or says more than yes or no.
     """
-    if info is None:
+    if info is None or (type(info) is dict and "life_lost" not in info):
         return False
     if not isinstance(info, Mapping):
         raise ValueError(f"info is a {type(info).__name__}, not a dict")

@@ -58,7 +58,8 @@ class GymnasiumEnvs(HostEnvs):
         self.spaces = describe(env.observation_space, env.action_space)
         self._read = observation_reader(env.observation_space)
         self._write = action_writer(env.action_space, rescale)
-        number, shape = len(self._slots), self.spaces.observation_shape
+        self._shape = self.spaces.observation_shape
+        number, shape = len(self._slots), self._shape
         dtype = np.uint8 if self.spaces.observation_kind == "image" else np.float64
         self._observation = np.zeros((number, *shape), dtype)
         self._final = np.zeros((number, *shape), dtype)
@@ -89,9 +90,9 @@ class GymnasiumEnvs(HostEnvs):
     def _put(self, rows: np.ndarray, index: int, observation: Any) -> None:
         """Copies an observation into its row; another shape must not be stretched to fit."""
         try:
-            read = np.asarray(self._read(observation))
-            if read.shape != rows.shape[1:]:
-                raise ValueError(f"shape {read.shape} instead of {rows.shape[1:]}")
+            read = self._read(observation)
+            if read.shape != self._shape:
+                raise ValueError(f"shape {read.shape} instead of {self._shape}")
         except Exception as error:
             slot = self._slots[index]
             raise EnvironmentFailure(
@@ -106,8 +107,8 @@ class GymnasiumEnvs(HostEnvs):
         self._life_lost[:] = False
         self._info = {}
         ended = False
-        for index in np.flatnonzero(active):
-            ended |= self._step_one(int(index), self._slots[index], action[index])
+        for index in np.flatnonzero(active).tolist():
+            ended |= self._step_one(index, self._slots[index], action[index])
         self._check_finite(active)
         return self._told(ended)
 
