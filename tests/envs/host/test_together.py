@@ -81,7 +81,7 @@ def test_a_vector_environment_that_cannot_be_used_is_refused_in_a_line() -> None
     ):
         with pytest.raises(BadInput, match=words):
             make_job("vector_worlds:same", **{"arm": "ppo", **settings})
-    with pytest.raises(BadInput, match="mode NEXT_STEP.*use mode SAME_STEP"):
+    with pytest.raises(BadInput, match=r"mode NEXT_STEP.*use mode SAME_STEP"):
         make_job("vector_worlds:later", arm="sauna", dropped="mask")
     make_job("vector_worlds:same", arm="sauna", dropped="mask")
     with pytest.raises(BadInput, match="Gymnasium knows no 'Nowhere-v0'"):
@@ -182,7 +182,7 @@ def test_agents_are_refused_what_they_cannot_do() -> None:
     with pytest.raises(BadInput, match="envs: 2 is no multiple of the 3 agents"):
         make_job("vector_worlds:Agents", arm="ppo", envs=2)
     with pytest.raises(BadInput, match="recurrent: a policy of several agents"):
-        make_job("vector_worlds:Agents", arm="ppo", envs=3, recurrent="gru")
+        make_job("vector_worlds:Agents", arm="ppo", envs=3, minibatches=2, recurrent="gru")
     with pytest.raises(BadInput, match="filter cannot pass over agents that wait"):
         make_job("vector_worlds:Agents", arm="sauna", envs=3, dropped="mask")
     with pytest.raises(BadInput, match="agent b has another observation space than a"):

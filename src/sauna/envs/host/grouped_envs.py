@@ -126,9 +126,8 @@ class GroupedEnvs(HostEnvs):
             if acting.any() and not acting.all():
                 raise self._failure(
                     group,
-                    "all rows of one "
-                    + self.kind
-                    + " must step together; some are active and some are not",
+                    f"all rows of one {self.kind} must step together; some are active and some "
+                    "are not",
                 )
             if not acting.any():
                 continue
