@@ -219,5 +219,5 @@ def fine_tuning_page(found: Mapping[str, Any]) -> str:
         steps=f"{found['steps']:,}",
         episodes=found["episodes"],
         table=markdown(rows),
-        commands="\n".join(unit["command"] for unit in found["arms"].values()),
+        commands="\n".join(dict.fromkeys(unit["command"] for unit in found["arms"].values())),
     )

@@ -264,6 +264,12 @@ def check_recurrent(config: Config) -> None:
         )
     if readers.CLONED[1](config):
         raise BadInput("init_from: recorded episodes are cloned step by step; use recurrent none")
+    replaced = config.filter != "none" and config.dropped == "replace"
+    if replaced and config.selection_mode == "refill":
+        raise BadInput(
+            "selection_mode: with recurrent and dropped replace an update takes as many gradient "
+            "steps as PPO's by itself; use fewer or smaller"
+        )
     if config.loss_weight != "none" and config.control == "random":
         raise BadInput(
             "control: the random control of a loss_weight needs a minibatch in random order, and "

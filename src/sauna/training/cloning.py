@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sauna.config.choices import BOUNDED
 from sauna.config.presets import Member
 from sauna.config.readers import DATA
 from sauna.config.settings import Config
@@ -115,9 +114,6 @@ def _check_kind(prepared: Prepared) -> None:
 
 def _read(prepared: Prepared) -> Demonstrations:
     config, spaces = prepared.config, prepared.spaces
-    if spaces.mask or spaces.pictures:
-        what = "action masks" if spaces.mask else "pictures beside other observations"
-        raise BadInput(f"init_from: cloning from data does not know {what}")
     name, text = config.init_from, config.init_from.removeprefix(DATA)
     if text.startswith(MINARI):
         episodes = read_minari(text, name, spaces, config.env)
@@ -126,14 +122,9 @@ def _read(prepared: Prepared) -> Demonstrations:
     made = make_env(config.env, json.loads(config.env_kwargs), wrapping_of(config))
     try:
         rescale = config.rescale_actions
-        data = demonstrations(episodes, spaces, made.action_space, rescale, name)
+        return demonstrations(episodes, spaces, made.action_space, rescale, name)
     finally:
         close(made)
-    if spaces.action_kind == "continuous" and config.distribution in BOUNDED:
-        from sauna.algorithm.policy.bounded import from_env
-
-        return data._replace(action=from_env(data.action))
-    return data
 
 
 def _moments(data: Demonstrations, config: Config) -> Moments | None:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.special import betaln, expit
 
-from sauna.algorithm.policy.bounded import TRIES, beta, from_env, log_slope, squashed, to_env
+from sauna.algorithm.policy.bounded import TRIES, beta, log_slope, squashed, to_env
 from sauna.algorithm.policy.distributions import Distribution, gaussian
 
 LOG_2 = np.log(2.0)
@@ -173,13 +173,6 @@ def test_the_deterministic_action_is_the_median_and_the_mean() -> None:
     np.testing.assert_allclose(
         expit(2 * np.arctanh(np.asarray(got, float))), shapes[:, 0] / shapes.sum(1), atol=1e-4
     )
-
-
-def test_somebody_elses_actions_have_a_u() -> None:
-    action = np.array([[-1.0, -0.5], [0.999, 1.0]], np.float32)
-    u = from_env(action)
-    assert u.dtype == np.float32 and np.isfinite(u).all()
-    np.testing.assert_allclose(to_env(squashed(2), u), action, atol=2e-6)
 
 
 def test_what_is_not_bounded_goes_to_the_environment_as_it_is() -> None:

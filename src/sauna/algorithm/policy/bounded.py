@@ -21,7 +21,6 @@ from sauna.algorithm.policy.distributions import Distribution, gaussian
 from sauna.algorithm.types import Array
 
 NODES = 32  # of the Gauss-Hermite rule for the squashed Gaussian's entropy
-LARGEST = 1.0 - 1e-6  # action of somebody else's that has a `u`
 TRIES = 6  # proposals of one gamma variate: 5% of them fail at most, so 2e-8 of the variates do
 
 
@@ -34,12 +33,6 @@ def to_env(distribution: Distribution, action: Any) -> Any:
     if not distribution.bounded:
         return action
     return np.tanh(action) if isinstance(action, np.ndarray) else jnp.tanh(action)
-
-
-def from_env(action: np.ndarray) -> np.ndarray:
-    """Returns `u` of actions `[..., A]` in [-1, 1]; one at a bound has that of `LARGEST`."""
-    inside = np.clip(np.asarray(action, np.float64), -LARGEST, LARGEST)
-    return np.arctanh(inside).astype(np.float32)
 
 
 def log_slope(u: Array) -> Array:

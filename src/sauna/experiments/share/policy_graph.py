@@ -6,7 +6,7 @@ is exported is compared with that before it is given away.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from sauna.algorithm.policy.observation import INVALID
 from sauna.algorithm.policy.recurrent import STATES
 from sauna.config.choices import BOUNDED
 from sauna.config.settings import Config
-from sauna.envs.shapes import mask_in
+from sauna.envs.shapes import leaves, mask_in
 from sauna.envs.spaces import Spaces, describe, stretch
 from sauna.experiments.share.graph import Graph
 from sauna.system.errors import BadInput
@@ -98,20 +98,8 @@ def _check(config: Config, spaces: Spaces) -> None:
 
 def _vector(graph: Graph, space: Any, dtype: str) -> str:
     """The observation as one vector `[B, obs]`, its parts in the order of `gym.flatten`."""
-    parts = [_part(graph, keys, part, dtype) for keys, part in _leaves(space, ())]
+    parts = [_part(graph, keys, part, dtype) for keys, part in leaves(space)]
     return parts[0] if len(parts) == 1 else graph.add("Concat", *parts)
-
-
-def _leaves(space: Any, keys: tuple[Any, ...]) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """The parts of a space in the order in which they are flattened."""
-    from gymnasium import spaces as gym
-
-    if isinstance(space, gym.Dict | gym.Tuple):
-        parts = space.spaces.items() if isinstance(space, gym.Dict) else enumerate(space.spaces)
-        for key, part in parts:
-            yield from _leaves(part, (*keys, key))
-    else:
-        yield keys, space
 
 
 def _part(graph: Graph, keys: tuple[Any, ...], space: Any, dtype: str) -> str:
