@@ -147,7 +147,7 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
 
     def read(observation: Any) -> np.ndarray:
         if agents:
-            return np.stack([reader(one) for one in observation])
+            return np.stack([reader(one) for one in env.rows(observation)])
         found = np.array(reader(observation))
         if found.shape != spaces.observation_shape:
             raise ValueError(
@@ -161,7 +161,7 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
     seen = [(read(observation), 0.0, False)]
     for _ in range(STEPS):
         observation, reward, terminated, truncated, info = five_of(
-            env.step(env.sample() if agents else _any_action(env, observation))
+            env.step(any_action(env, observation))
         )
         life_lost(info)  # raises where it cannot be read
         seen.append((read(observation), one_number(reward), bool(terminated or truncated)))
@@ -170,13 +170,20 @@ def _play(env: Any, spaces: Spaces, seed: int) -> list[tuple[np.ndarray, float, 
     return seen
 
 
-def _any_action(env: Any, observation: Any) -> Any:
-    """Draws an action, a valid one if the observation holds a mask."""
+def any_action(env: Any, observation: Any) -> Any:
+    """Draws an action, a valid one if the observation holds a mask; of agents one for each."""
+    if isinstance(env, AgentsAsOne):
+        return env.sample()
     if not mask_in(env.observation_space)[0]:
         return env.action_space.sample()
     from sauna.envs.masked import sample_valid
 
     return sample_valid(env.action_space, observation["action_mask"])
+
+
+def each_observation(env: Any, observation: Any) -> list[Any]:
+    """The observation, or that of each agent that is there."""
+    return env.rows(observation) if isinstance(env, AgentsAsOne) else [observation]
 
 
 def _difference(

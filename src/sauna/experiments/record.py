@@ -25,6 +25,7 @@ from sauna.training.artifact import check_spaces, find_member, load_artifact
 from sauna.training.data.episodes import MINARI, Add, Recorded
 from sauna.training.data.minari_sets import minari_writer
 from sauna.training.data.parquet import parquet_writer
+from sauna.training.located import locate
 
 
 @names_the_folder
@@ -51,7 +52,7 @@ def record(
     They are those that `evaluate` plays with the same arguments.
 
     Args:
-      run: the run directory.
+      run: the run directory; or an exported policy: its folder, `zoo:NAME`, `hf:USER/NAME`.
       to: `minari:NAME` (below `MINARI_DATASETS_PATH`, by default `~/.minari/datasets`),
         `minari:./FOLDER/NAME`, or a file `*.parquet`. Neither may be there already.
       member: name or index; default the first.
@@ -73,7 +74,7 @@ def record(
     Raises:
       BadInput: as `evaluate`; or `to` is there already, is no name, or needs a library.
     """
-    run, to = Path.cwd() / run, str(to)  # an environment may go elsewhere
+    run, to = locate(run).folder, str(to)  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
     if not to.startswith(MINARI) and Path(to).suffix != ".parquet":

@@ -26,6 +26,7 @@ FILES = (
     "numpy/policy.safetensors",
 )
 LARGEST = 2**32  # bytes of one policy
+COMMIT = re.compile("[0-9a-f]{40}")
 NAME = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+)(?:@(?P<revision>[\w./-]+))?")
 
 
@@ -57,16 +58,33 @@ def download(name: str, folder: Path) -> Path:
 def cached(name: str) -> Path:
     """Fetches a policy into the cache, unless that has its newest commit; returns its folder.
 
+    A commit that the cache has is opened without the network.
+
     Raises:
       BadInput, SaunaError: as `download`.
     """
     repo, revision = read_name(name)
+    if revision and COMMIT.fullmatch(revision) and _holds_policy(_kept(repo, revision)):
+        return _kept(repo, revision)
     with _client() as hub:
         info = hub.model_info(repo, revision=revision, files_metadata=True)
+    folder = _kept(repo, str(info.sha))
+    try:
+        return folder if folder.is_dir() else _fetch(repo, info, folder)
+    except SaunaError:
+        if _holds_policy(folder):  # another process fetched it meanwhile
+            return folder
+        raise
+
+
+def _kept(repo: str, commit: str) -> Path:
+    """The folder of one commit in the cache."""
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    commit = re.sub(r"\W", "-", str(info.sha))
-    folder = Path(base) / "sauna" / "hub" / repo / commit
-    return folder if folder.is_dir() else _fetch(repo, info, folder)
+    return Path(base) / "sauna" / "hub" / repo / re.sub(r"\W", "-", commit)
+
+
+def _holds_policy(folder: Path) -> bool:
+    return (folder / POLICY).is_file()
 
 
 def _fetch(repo: str, info: Any, folder: Path) -> Path:
@@ -86,6 +104,8 @@ def _fetch(repo: str, info: Any, folder: Path) -> Path:
             )
         shutil.rmtree(new / ".cache", ignore_errors=True)  # the client's notes
         new.replace(folder)
+    except OSError as error:
+        raise SaunaError(f"hub: cannot make {folder}: {one_line(error)}") from error
     finally:
         shutil.rmtree(new, ignore_errors=True)
     return folder

@@ -21,6 +21,7 @@ from sauna.system.errors import BadInput
 from sauna.system.run_directory import INITIAL, is_exported
 from sauna.training.artifact import Artifact, find_member, load_artifact, policy_arrays
 from sauna.training.cloning import clone_members, is_data
+from sauna.training.located import HUB, ZOO, locate
 from sauna.training.prepare import Prepared
 
 # What has to be the same, beside the spaces, for weights to mean the same.
@@ -45,6 +46,9 @@ class Source:
 
     def __init__(self, text: str) -> None:
         path, self.best = Path(text), False
+        if text.startswith((ZOO, HUB)):
+            self.run, self.member = locate(text).folder, ""
+            return
         if path.name == "best":
             path, self.best = path.parent, True
         self.run, self.member = path, ""

@@ -35,13 +35,21 @@ class Prepared(NamedTuple):
 
     Attributes:
       run: its settings, with all that depends on the machine and the environment decided.
-      spaces: of its environment.
-      differs: how two equal episodes of the environment differed; None if it repeats itself.
+      found: what is known of its environment.
     """
 
     run: RunConfig
-    spaces: Spaces
-    differs: str | None
+    found: Probe
+
+    @property
+    def spaces(self) -> Spaces:
+        """Those of its environment."""
+        return self.found.spaces
+
+    @property
+    def differs(self) -> str | None:
+        """How two equal episodes of the environment differed; None if it repeats itself."""
+        return self.found.differs
 
     @property
     def config(self) -> Config:
@@ -145,7 +153,7 @@ def examine(run: RunConfig, overrides: Mapping[str, Any], found: Probe | None = 
     asked = parsed.get("processes", 0)
     if _together(run.config) and asked > 1:
         raise BadInput(f"processes: {asked} asked for, but all members and devices are one program")
-    return Prepared(run, found.spaces, found.differs)
+    return Prepared(run, found)
 
 
 def look_at(config: Config) -> Probe:

@@ -14,6 +14,7 @@ import numpy as np
 
 from sauna.config.presets import RunConfig
 from sauna.config.stored import read_stored, to_stored
+from sauna.envs.probe import Probe
 from sauna.envs.spaces import Spaces, read_spaces
 from sauna.system.errors import BadInput, SaunaError, one_line
 from sauna.system.jax_setup import configure_jax
@@ -159,7 +160,7 @@ def write_job(
 
 def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
     """Reads the `Job` of a `write_job` header."""
-    prepared = Prepared(read_stored(header), read_spaces(header["spaces"]), None)
+    prepared = Prepared(read_stored(header), Probe(read_spaces(header["spaces"]), None))
     return prepared.job(
         header["members"],
         **{"restored" if header["is_restored"] else "initial": arrays or None},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -83,6 +84,14 @@ def test_what_the_hub_refuses_is_one_line(hub: FakeHub, tmp_path: Path, monkeypa
     with pytest.raises(BadInput, match="has more than 10 bytes"):
         sauna.pull("some/model", tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_commit_in_the_cache_opens_without_the_network(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(client, "_client", None)
+    folder = tmp_path / "sauna/hub/me/pole" / ("0a" * 20)
+    shutil.copytree(OWN, folder)
+    assert client.cached(f"me/pole@{folder.name}") == folder
 
 
 @pytest.mark.parametrize("name", ["pole", "a/b/c", "me/../x", "me/pole@", "me/..", ""])

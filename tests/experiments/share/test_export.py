@@ -19,6 +19,7 @@ from sauna.system.checkpoint import BadCheckpoint, NewerFormat
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
 from sauna.training.initial import load_initial
+from sauna.training.located import zoo
 
 SETTINGS = {**SMALL, "processes": 1, "steps": 64, "eval_every": 32, "eval_episodes": 1}
 
@@ -88,6 +89,16 @@ def test_a_new_run_starts_from_it(run: Path, policy: Path, tmp_path: Path) -> No
     expected = load_artifact(policy).checkpoint.arrays
     for name in ("params/policy_head/kernel", "observation_moments/mean"):
         np.testing.assert_array_equal(initial[f"ppo/0/{name}"], expected[f"ppo/1/{name}"])
+
+
+def test_a_path_that_it_started_from_is_left_out(tmp_path: Path) -> None:
+    own = zoo()["CartPole-v1"]
+    stored = run_directory.read_config(own, exported=True)
+    config = {**stored["config"], "init_from": "data:/home/me/secret.parquet"}
+    again = sauna.export(changed(own, tmp_path / "old", config=config), tmp_path / "x", episodes=0)
+    for name in ("README.md", "policy.json"):
+        assert "secret" not in (again / name).read_text()
+    sauna.load(again)
 
 
 def test_the_card_says_what_was_done(run: Path, policy: Path) -> None:

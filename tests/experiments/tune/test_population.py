@@ -195,6 +195,9 @@ def _unpatched(real: Any, target: Any, name: str, patched: pytest.MonkeyPatch) -
         ({"space": "epochs = [1, 2]\n"}, "epochs shapes the program, which a population shares"),
         ({"exchange_every": 192}, "would come after the last iteration"),
         ({"given": {"seeds": 2}}, "a population has one, which all its members share"),
+        ({"given": {"arm": "sauna", "dropped": "replace"}}, "give mask"),
+        ({"given": {"eval_every": 1, "stop_at": 0.0}}, "stop_at: a population trains to its end"),
+        ({"given": {"learning_rate_schedule": "kl"}}, "not read after the start of a population"),
     ],
 )
 def test_what_a_population_cannot_do_is_refused(changes, message, tmp_path: Path) -> None:

@@ -15,12 +15,14 @@ from command_line import sauna_here
 from helpers import SMALL
 from sauna.api import train as train_run
 from sauna.experiments.tune import command, search, storage
+from sauna.experiments.tune.batch import prepared_batch
 from sauna.experiments.tune.command import tune
 from sauna.experiments.tune.fresh import fresh_spec
 from sauna.experiments.tune.plan import make_plan
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.training.display import PlainDisplay
+from sauna.training.prepare import prepare
 
 optuna = pytest.importorskip("optuna")
 
@@ -168,6 +170,13 @@ def test_settings_that_are_refused_are_failed_trials(tmp_path: Path) -> None:
     assert all("5 does not divide" in trial["error"] for trial in found["trials"])
     assert found["best"] is None and not (folder / "tuned.json").exists()
     assert found["env_steps"]["trials"] == 0
+
+
+def test_a_trial_is_refused_what_rows_that_act_together_cannot_do(tmp_path: Path) -> None:
+    start = prepare({**GIVEN, "envs": 2})
+    agents = start._replace(found=start.found._replace(group=2))
+    with pytest.raises(BadInput, match=r"^envs: 3 is no multiple of the 2 agents"):
+        prepared_batch({"trial-0": {**GIVEN, "envs": 3}}, [0], agents, tmp_path)
 
 
 def rows(returns: list[float], arm: str = "trial-0", seed: int = 0) -> list[dict[str, Any]]:

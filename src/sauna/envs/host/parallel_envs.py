@@ -149,6 +149,12 @@ class AgentsAsOne:
         """Draws an action for each agent that is there."""
         return [self.action_space.sample() for _ in self._there]
 
+    def rows(self, batch: Any) -> list[Any]:
+        """The observation of each agent that is there, of the last answer."""
+        from gymnasium.vector.utils import batch_space, iterate
+
+        return list(iterate(batch_space(self.observation_space, len(self._there)), batch))
+
     def render(self) -> Any:
         return self.env.render()
 

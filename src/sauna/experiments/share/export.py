@@ -142,7 +142,8 @@ def _played(
 def _manifest(run: Path, artifact: Artifact, name: str, best: bool) -> dict[str, Any]:
     """Says what the policy is and where it comes from; no path or machine of the user's."""
     before = artifact.checkpoint.manifest
-    usual = {field: FIELDS[field].default for field in fields_with("machine_local")}
+    hidden = (*fields_with("machine_local"), "init_from")  # which may be a path of the user's
+    usual = {field: FIELDS[field].default for field in hidden}
     if artifact.is_exported:
         steps, training = before["env_steps"], before.get("training", {})
     else:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.host.answers import first_of, five_of
+from sauna.envs.probe import any_action, each_observation
 from sauna.experiments.share.graph import Graph
 from sauna.system.errors import BadInput, SaunaError
 
@@ -19,7 +20,7 @@ TOLERANCE = 1e-5  # of an action, times its size if that is above 1
 
 
 def observations_of(env: Any, number: int = OBSERVATIONS, seed: int = 0) -> list[Any]:
-    """What an environment gives under random actions: `number` raw observations."""
+    """What an environment gives under random valid actions: `number` raw ones."""
     env.action_space.seed(seed)
     found: list[Any] = []
     ended = True
@@ -27,10 +28,12 @@ def observations_of(env: Any, number: int = OBSERVATIONS, seed: int = 0) -> list
         if ended:
             observation, ended = first_of(env.reset(seed=seed + len(found))), False
         else:
-            observation, _, terminated, truncated, _ = five_of(env.step(env.action_space.sample()))
+            observation, _, terminated, truncated, _ = five_of(
+                env.step(any_action(env, observation))
+            )
             ended = bool(terminated or truncated)
-        found.append(observation)
-    return found
+        found += each_observation(env, observation)
+    return found[:number]
 
 
 def stacked(seen: Sequence[Any]) -> Any:

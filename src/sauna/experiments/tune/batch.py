@@ -9,7 +9,6 @@ from typing import Any
 
 from sauna.config.presets import RunConfig, resolve_run
 from sauna.config.settings import Config, fields_with
-from sauna.envs.probe import Probe
 from sauna.system.errors import BadInput
 from sauna.training import run as runs
 from sauna.training.coordinator import Callback
@@ -62,8 +61,7 @@ def prepared_batch(
         config = run.config
         iterations = config.steps // (config.rollout_steps * config.envs)
         changes["checkpoint_every"] = max(iterations // CHECKPOINTS, 1)
-    found = Probe(start.spaces, start.differs)
-    return examine(run.replace(**changes), {**first, "seeds": list(seeds)}, found)
+    return examine(run.replace(**changes), {**first, "seeds": list(seeds)}, start.found)
 
 
 def train(

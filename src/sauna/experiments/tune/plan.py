@@ -132,7 +132,7 @@ def make_plan(
     check_own_parts(start)
     values = dict(space) if space is not None else default_space(start.config)
     if population:
-        values = _of_population(values, given_space=space is not None)
+        values = _of_population(values, start.config, given_space=space is not None)
         exchange_every = exchange_every or max(start.config.steps // EXCHANGES, 1)
     _check_searched(values, start.config)
     return (
@@ -155,8 +155,8 @@ def make_plan(
     )
 
 
-def _of_population(values: dict[str, Any], given_space: bool) -> dict[str, Any]:
-    """Keeps what changes during training.
+def _of_population(values: dict[str, Any], config: Config, given_space: bool) -> dict[str, Any]:
+    """Keeps what an exchange can change.
 
     Raises:
       BadInput: the user wants to search something else.
@@ -168,7 +168,13 @@ def _of_population(values: dict[str, Any], given_space: bool) -> dict[str, Any]:
             f"space: {', '.join(fixed)} shapes the program, which a population shares; leave it "
             f"out or tune without --population-based"
         )
-    return {name: values[name] for name in kept}
+    followed = config.learning_rate_schedule == "kl" and "learning_rate" in kept
+    if given_space and followed:
+        raise BadInput(
+            "space: learning_rate is not read after the start of a population with "
+            "learning_rate_schedule kl; leave it out"
+        )
+    return {name: values[name] for name in kept if not (followed and name == "learning_rate")}
 
 
 def _check_searched(values: Mapping[str, Any], config: Config) -> None:

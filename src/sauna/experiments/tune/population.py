@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.config.presets import RunConfig
-from sauna.config.settings import to_json
+from sauna.config.settings import FIELDS, to_json
 from sauna.config.stored import read_stored, to_stored
 from sauna.experiments.tune.batch import prepared_batch, train
 from sauna.experiments.tune.plan import Plan
@@ -88,11 +88,20 @@ def check_population(plan: Plan, start: Prepared) -> None:
     """Refuses a population that cannot be trained.
 
     Raises:
-      BadInput: there are several seeds, or no exchange would happen.
+      BadInput: there are several seeds, members may end early, or no exchange would happen.
     """
+    config = start.config
     if len(plan.seeds) > 1:
         raise BadInput("seeds: a population has one, which all its members share")
-    if iterations_between(plan, start) >= start.config.steps // samples_of(start):
+    if config.filter != "none" and config.dropped == "replace":
+        raise BadInput(
+            "dropped: the members of a population need iterations of equally many env steps; "
+            "give mask (--dropped mask)"
+        )
+    for name in ("stop_at", "stop_when_flat"):
+        if getattr(config, name) != FIELDS[name].default:
+            raise BadInput(f"{name}: a population trains to its end; leave it out")
+    if iterations_between(plan, start) >= config.steps // samples_of(start):
         raise BadInput(
             f"exchange_every: the first exchange, after {plan.exchange_every} env steps, would "
             f"come after the last iteration"

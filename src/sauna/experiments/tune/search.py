@@ -226,7 +226,8 @@ class Watch:
         return self._report(trial, steps, float(np.mean([*self._scores[arm].values()])))
 
     def _report(self, trial: Trial, steps: int, score: float) -> bool:
-        known = self._known(trial)
+        stored = trial.study.get_trials(deepcopy=False)[trial.number]
+        known = stored.intermediate_values
         due = [n for n in range(1, steps * storage.REPORTS // self._steps + 1) if n not in known]
         for number in due:
             trial.report(score, number)
@@ -234,10 +235,6 @@ class Watch:
             return False
         trial.set_user_attr(PRUNED, steps)
         return True
-
-    @staticmethod
-    def _known(trial: Trial) -> set[int]:
-        return set(trial._cached_frozen_trial.intermediate_values)
 
 
 def steps_of(run: Path) -> int:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 BATCH_SIZE = "batch_size"
 GROUPS = ("learning", "network", "normalisation", "selection", "update rules")
 TUNABLE = (*(name for name, f in FIELDS.items() if f.metadata["group"] in GROUPS), BATCH_SIZE)
-LEAST_ITERATIONS = 8  # that the default space leaves of a trial
+MIN_ITERATIONS = 8  # that the default space leaves of a trial
 
 # The values of RL Zoo's `hyperparams_opt.py` for PPO and A2C (DLR-RM/rl-baselines3-zoo) for the
 # most part. Ours differ so: learning rates end at 1e-2 instead of 1, value_coef is twice its
@@ -198,7 +198,7 @@ def default_space(config: Config) -> dict[str, Any]:
         for name, values in DEFAULT.items()
         if is_read("minibatches" if name == BATCH_SIZE else name, config)
     }
-    most = config.steps // (LEAST_ITERATIONS * config.envs)
+    most = config.steps // (MIN_ITERATIONS * config.envs)
     fitting = [steps for steps in DEFAULT["rollout_steps"] if steps <= most]
     if fitting:
         return {**found, "rollout_steps": fitting}
