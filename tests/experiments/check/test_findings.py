@@ -15,6 +15,7 @@ from sauna.config.plugins import name_of
 from sauna.experiments.check.findings import WARNING, WRONG, check
 from sauna.experiments.check.played import why_outside
 from sauna.system.errors import BadInput
+from vector_worlds import Agents
 
 
 class Good(gymnasium.Env):
@@ -137,6 +138,24 @@ def test_what_is_wrong_is_named(env: type, kind: str, text: str) -> None:
     findings = found(env)
     assert [k for k, said in findings if text in said] == [kind], findings
     assert findings == sorted(findings, key=lambda finding: finding[0] != WRONG)
+
+
+class Choosy(Good):
+    """It takes valid actions alone."""
+
+    action_space = gym.Discrete(3)
+
+    def action_masks(self) -> Any:
+        return np.arange(3) != self.left % 3
+
+    def step(self, action: Any) -> Any:
+        assert self.action_masks()[action]
+        return super().step(action)
+
+
+@pytest.mark.parametrize("env", [name_of(Choosy), "make_vec/CartPole-v1", name_of(Agents)])
+def test_masks_rows_and_agents_are_played_as_they_take_it(env: str) -> None:
+    assert [text for kind, text, _ in check(env, {}, 60).findings if kind == WRONG] == []
 
 
 def test_gymnasiums_checker_is_asked() -> None:

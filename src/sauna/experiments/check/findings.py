@@ -12,9 +12,12 @@ import numpy as np
 
 from sauna.config.settings import parse
 from sauna.envs.host.answers import close
+from sauna.envs.host.together import group_size
 from sauna.envs.make import is_native, make_env
+from sauna.envs.masked import MaskedEnv, mask_method
 from sauna.envs.probe import probe
 from sauna.envs.spaces import MAX_BOUND, describe
+from sauna.envs.wrapping import PLAIN, Wrapping
 from sauna.experiments.check.played import Played, play
 from sauna.system.errors import BadInput, one_line
 
@@ -62,14 +65,22 @@ def check(env: str, env_kwargs: Mapping[str, Any] | str, steps: int) -> Checked:
     facts = [f"observations: {made.observation_space}", f"actions: {made.action_space}"]
     try:
         findings = list(_of_spaces(made))
-        if not is_native(env, kwargs):
-            findings += _of_gymnasium(made)
-        findings += _of_playing(made, steps, facts)
-        if not any(finding.fix == FIRST for finding in findings):
-            findings += _of_repeating(env, kwargs)
+        played, wrapping = _with_masks(made)
+        if not is_native(env, kwargs) and group_size(made) is None and played is made:
+            findings += _of_gymnasium(made)  # which knows no masks and no rows
+        findings += _of_playing(played, steps, facts)
+        if group_size(made) is None and not any(finding.fix == FIRST for finding in findings):
+            findings += _of_repeating(env, kwargs, wrapping)
     finally:
         close(made)
     return Checked(facts, sorted(findings, key=lambda finding: finding.kind != WRONG))
+
+
+def _with_masks(env: Any) -> tuple[Any, Wrapping]:
+    """The environment as a training with masks plays it, if it has the method for them."""
+    if group_size(env) is not None or mask_method(env) is None:
+        return env, PLAIN
+    return MaskedEnv(env), Wrapping(action_mask=True)
 
 
 def _of_spaces(env: Any) -> Iterator[Finding]:
@@ -201,9 +212,9 @@ def _speed(env: Any, seen: Played) -> Iterator[Finding]:
         )
 
 
-def _of_repeating(env: str, kwargs: dict[str, Any]) -> Iterator[Finding]:
+def _of_repeating(env: str, kwargs: dict[str, Any], wrapping: Wrapping) -> Iterator[Finding]:
     try:
-        found = probe(env, kwargs)
+        found = probe(env, kwargs, wrapping)
     except BadInput as error:
         yield Finding(WRONG, str(error), FIRST)
         return

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.host.answers import first_of, five_of, one_number
+from sauna.envs.probe import any_action, each_observation
 
 SECONDS = 20.0  # after which no further step is played
 
@@ -41,9 +42,10 @@ def play(env: Any, steps: int) -> Played:
     """Plays with random actions, for `steps` env steps or `SECONDS`."""
     seen, length = Played(), 0
     env.action_space.seed(0)
-    _look(env, first_of(env.reset(seed=0)), seen)
+    observation = first_of(env.reset(seed=0))
+    _look(env, observation, seen)
     while seen.steps < steps and seen.seconds < SECONDS:
-        action = env.action_space.sample()
+        action = any_action(env, observation)
         before = time.perf_counter()
         observation, reward, terminated, truncated, _ = five_of(env.step(action))
         seen.seconds += time.perf_counter() - before
@@ -62,7 +64,12 @@ def play(env: Any, steps: int) -> Played:
     return seen
 
 
-def _look(env: Any, observation: Any, seen: Played) -> None:
+def _look(env: Any, given: Any, seen: Played) -> None:
+    for observation in each_observation(env, given):
+        _look_at(env, observation, seen)
+
+
+def _look_at(env: Any, observation: Any, seen: Played) -> None:
     space = env.observation_space
     if not space.contains(observation):
         seen.outside += 1
