@@ -146,3 +146,10 @@ def test_the_device_shows_the_same_mask_as_its_gymnasium_interface() -> None:
         face.step(action)
         transition = jax.jit(one.step)(state, action)
         state, seen = transition.state, transition.observation
+
+
+def test_an_environment_that_raises_at_invalid_actions_gets_a_hint() -> None:
+    with pytest.raises(
+        BadInput, match=r"is not valid.*; it has action_masks\(\): give --action-mask"
+    ):
+        probe("worlds:Choosy", {"by": "method"})

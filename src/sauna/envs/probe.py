@@ -10,6 +10,7 @@ from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_num
 from sauna.envs.host.parallel_envs import AgentsAsOne
 from sauna.envs.host.together import group_size, may_wait
 from sauna.envs.make import make_env
+from sauna.envs.masked import mask_method
 from sauna.envs.shapes import check_shapes, mask_in
 from sauna.envs.spaces import Spaces, describe, observation_reader
 from sauna.envs.wrapping import PLAIN, Wrapping, wrapped_space
@@ -55,7 +56,9 @@ def probe(env: str, env_kwargs: dict[str, Any], wrapping: Wrapping = PLAIN) -> P
     except BadInput:
         raise
     except Exception as error:  # whatever a user's environment raises when played
-        raise BadInput(f"env: {env} cannot be played: {one_line(error)}") from error
+        masked = not wrapping.action_mask and mask_method(first) is not None
+        hint = "; it has action_masks(): give --action-mask" if masked else ""
+        raise BadInput(f"env: {env} cannot be played: {one_line(error)}{hint}") from error
     finally:
         close(first)
         close(second)
