@@ -30,7 +30,7 @@ def kept(monkeypatch) -> list[Recorded]:
     found: list[Recorded] = []
 
     @contextmanager
-    def writer(to, env, about):
+    def writer(to, env, about, wrapping):
         yield found.append
 
     monkeypatch.setattr(recording, "_writer", writer)

@@ -15,7 +15,7 @@ from sauna.config.imported_from import names_the_folder
 from sauna.envs.host.answers import close, one_number
 from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
-from sauna.envs.wrapping import Wrapping, wrapping_of
+from sauna.envs.wrapping import PLAIN, Wrapping, wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.episodes import kwargs_of, provided, statistics
 from sauna.experiments.evaluate.play import Progress
@@ -120,7 +120,7 @@ def record(
 
 
 def _writer(
-    to: str, env: Any, about: Mapping[str, Any], wrapping: Wrapping
+    to: str, env: Any, about: Mapping[str, Any], wrapping: Wrapping = PLAIN
 ) -> AbstractContextManager[Add]:
     if to.startswith(MINARI):
         return minari_writer(to, env, about, wrapping)

@@ -117,7 +117,7 @@ def test_a_record_loads_no_jax() -> None:
 def test_a_study_takes_a_measurement_of_the_users_own(tmp_path: Path) -> None:
     (tmp_path / "own_norm.py").write_text(OWN)
     (tmp_path / "mine.toml").write_text(STUDY)
-    done = sauna("study", "mine.toml", "--processes", "1", cwd=tmp_path)
+    done = sauna("study", "mine.toml", "--processes", "1", "--trust", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     place = tmp_path / "runs" / "mine"
     assert "measuring norm: 1 members" in done.stdout

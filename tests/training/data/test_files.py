@@ -22,9 +22,13 @@ from sauna.training.data.parquet import read_parquet
 from sauna.training.prepare import prepare
 
 pytestmark = pytest.mark.slow
-pyarrow = pytest.importorskip("pyarrow")
-minari = pytest.importorskip("minari")
-pytest.importorskip("h5py")
+
+
+@pytest.fixture(autouse=True)
+def extras() -> None:
+    for name in ("pyarrow", "minari", "h5py"):
+        pytest.importorskip(name, reason="needs `pip install 'sauna-rl[minari,parquet]'`")
+
 
 KINDS: dict[str, dict[str, Any]] = {
     "worlds:Scripted": {},
@@ -78,6 +82,8 @@ def test_both_kinds_of_file_give_the_same_learners_data(env: str, tmp_path: Path
 
 def test_minari_users_find_the_dataset_and_pandas_users_the_table(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    import minari
+
     kept = recorded("CartPole-v1", {}, "minari:cartpole/random-v3", 4)
     dataset = minari.load_dataset("cartpole/random-v3")
     steps = sum(len(one.reward) for one in kept["episodes"])

@@ -210,8 +210,12 @@ def moved_in_time(decisions: list[list[np.ndarray]], random: np.random.Generator
 
 
 def _of_envs(x: Any, rollout: Rollout) -> list[np.ndarray]:
-    """The valid steps of `x` `[S, N, ...]`, for each env: `[steps, ...]`."""
-    return [np.asarray(x)[acted, n] for n, acted in enumerate(np.asarray(rollout.valid).T)]
+    """The valid steps of `x` `[<= S, N, ...]`, for each env: `[steps, ...]`.
+
+    Rows behind the last step of any env may be missing in `x`.
+    """
+    x = np.asarray(x)
+    return [x[acted[: len(x)], n] for n, acted in enumerate(np.asarray(rollout.valid).T)]
 
 
 def _flat(rollout: Rollout, advantage: np.ndarray, seen: np.ndarray) -> Stream:
