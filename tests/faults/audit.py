@@ -63,7 +63,10 @@ def audit(
         written = event == "open" and int(arguments[2]) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
         fine = (inside[0],) if written else (inside[0], *shared)
         outside = isinstance(named, (str, bytes, Path)) and not str(named).startswith(fine)
-        if outside or event.startswith(FORBIDDEN):
+        # `inspect` parses the signature that a function of C has as text; nothing is run.
+        source = arguments[0] if event == "compile" else None
+        parsed = isinstance(source, bytes) and source.startswith(b"def foo(")
+        if outside or (event.startswith(FORBIDDEN) and not parsed):
             events.append(f"{event} {str(arguments)[:80]}")
 
     sys.addaudithook(hook)

@@ -98,7 +98,11 @@ MUTANTS = [
             "take(rollout.value, final_row)",
         ),
         ("episodes start a step early", "jnp.cumsum(ended, 0) - ended", "jnp.cumsum(ended, 0)"),
-        ("return without its value", "return_ = advantage + value", "return_ = advantage"),
+        (
+            "return without its value",
+            "rows, advantage, advantage + take(rollout.value, rows), config, target",
+            "rows, advantage, advantage, config, target",
+        ),
         (
             "empty slots count",
             "weight = take(rollout.keep, rows).astype(jnp.float32)",
@@ -272,8 +276,8 @@ MUTANTS = [
         ),
         (
             "acts without noise",
-            "policy.apply(params, observation).policy, noise)",
-            "policy.apply(params, observation).policy, 0.0 * noise)",
+            "policy.apply(params, observation), noise)",
+            "policy.apply(params, observation), 0.0 * noise)",
         ),
     ),
     *_of(
@@ -453,7 +457,7 @@ MUTANTS = [
         ),
         (
             "the critic loses rows, too",
-            "choice = Choice(keep=present)",
+            "choice = Choice(keep=batch.weight > 0)",
             "choice = Choice(keep=choice.keep)",
         ),
         (

@@ -33,6 +33,7 @@ OTHERS = {
     "seeds": [7],
     "preset": "mujoco-release",
     "hidden": [8, 9],
+    "value_hidden": [8],
     "gamma": 0.5,
     "gae_lambda": 0.5,
     "drop_rate": 0.25,
@@ -74,7 +75,8 @@ def _change_setting(whole: Path, run: Path, name: str, tally: Tally) -> None:
     before = stored["config"][name]
     stored["config"][name] = _other(name, before)
     path.write_text(json.dumps(stored))
-    refuser = "env" if name == "env_kwargs" else name  # the environment cannot be made with them
+    # The environment cannot be made with them; the sequences do not fill the minibatches.
+    refuser = {"env_kwargs": "env", "recurrent": "minibatches"}.get(name, name)
     _expect_refusal(run, refuser, f"setting {name}", tally)
 
 
