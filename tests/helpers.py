@@ -13,6 +13,7 @@ from sauna.algorithm.rollout.program import Program, make_program
 from sauna.config.presets import resolve
 from sauna.config.settings import Config
 from sauna.envs.host.contract import Step
+from sauna.training.display import PlainDisplay
 from sauna.training.loop.job import Job
 from sauna.training.loop.member_state import flat_params
 from sauna.training.prepare import prepare
@@ -35,6 +36,13 @@ def environment() -> dict[str, str]:
     """Of a process that finds the environments of `worlds.py`."""
     path = [TESTS, *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
+
+
+class Silent(PlainDisplay):
+    """A display that prints nothing."""
+
+    def say(self, text: str) -> None:
+        pass
 
 
 class Recorder:

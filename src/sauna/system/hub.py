@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.system.errors import BadInput, SaunaError, one_line
+from sauna.system.safe_write import new_folder
 
 POLICY = "policy.json"
 FILES = (
@@ -95,19 +95,15 @@ def _fetch(repo: str, info: Any, folder: Path) -> Path:
         raise BadInput(f"hub: {repo} holds no policy of SAUNA (it has no {POLICY})")
     if sum(sizes[name] for name in wanted) > LARGEST:
         raise BadInput(f"hub: {repo} has more than {LARGEST} bytes")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    new = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.writing")
     try:
-        with _client() as hub:
-            hub.snapshot_download(
-                repo, revision=info.sha, local_dir=new, allow_patterns=wanted, max_workers=1
-            )
-        shutil.rmtree(new / ".cache", ignore_errors=True)  # the client's notes
-        new.replace(folder)
+        with new_folder(folder) as new:
+            with _client() as hub:
+                hub.snapshot_download(
+                    repo, revision=info.sha, local_dir=new, allow_patterns=wanted, max_workers=1
+                )
+            shutil.rmtree(new / ".cache", ignore_errors=True)  # the client's notes
     except OSError as error:
         raise SaunaError(f"hub: cannot make {folder}: {one_line(error)}") from error
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
     return folder
 
 

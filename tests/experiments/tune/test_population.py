@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
-from helpers import SMALL
+from helpers import SMALL, Silent
 from sauna.experiments.tune import population
 from sauna.experiments.tune.command import tune
 from sauna.experiments.tune.population import copied, exchanges
 from sauna.experiments.tune.space import read_space
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, Interrupted
-from sauna.training.display import PlainDisplay
 
 GIVEN = {"env": "worlds:MatchingAction", **{k: v for k, v in SMALL.items() if k != "seeds"}}
 GIVEN |= {"preset": "discrete", "steps": 192}  # 6 iterations of 32 steps
 SPACE = "learning_rate = {low = 1e-4, high = 1e-1, log = true}\ngamma = [0.5, 0.9, 0.99]\n"
 
 
-@pytest.fixture(autouse=True, scope="module")
-def no_page() -> Iterator[None]:
-    """Draws nothing: a page costs more than these trainings, and has a test of its own."""
-    with patch("sauna.experiments.tune.results.write_page"):
-        yield
-
-
-class Silent(PlainDisplay):
-    def say(self, text: str) -> None:
-        pass
+pytestmark = pytest.mark.usefixtures("no_page")
 
 
 def trained(folder: Path, **changes: Any) -> tuple[dict[str, Any], Path]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from command_line import sauna_here
-from helpers import SMALL
+from helpers import SMALL, Silent
 from sauna.api import train as train_run
 from sauna.experiments.tune import command, search, storage
 from sauna.experiments.tune.batch import prepared_batch
@@ -21,7 +20,6 @@ from sauna.experiments.tune.fresh import fresh_spec
 from sauna.experiments.tune.plan import make_plan
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted, SaunaError
-from sauna.training.display import PlainDisplay
 from sauna.training.prepare import prepare
 
 optuna = pytest.importorskip("optuna")
@@ -48,16 +46,7 @@ HOW: dict[str, Any] = {
 }
 
 
-@pytest.fixture(autouse=True, scope="module")
-def no_page() -> Iterator[None]:
-    """Draws nothing: a page costs more than these trainings, and has a test of its own."""
-    with patch("sauna.experiments.tune.results.write_page"):
-        yield
-
-
-class Silent(PlainDisplay):
-    def say(self, text: str) -> None:
-        pass
+pytestmark = pytest.mark.usefixtures("no_page")
 
 
 def tuned(folder: Path, **options: Any) -> tuple[dict[str, Any], Path]:
@@ -69,7 +58,7 @@ def tuned(folder: Path, **options: Any) -> tuple[dict[str, Any], Path]:
     return tune(given, folder, display=Silent, say=lambda text: None, jobs=1, **options)
 
 
-def told(found: dict[str, Any]) -> list[Any]:
+def answers(found: dict[str, Any]) -> list[Any]:
     return [(t["state"], t["return"], t["searched"], t["curve"]) for t in found["trials"]]
 
 
@@ -104,8 +93,8 @@ def test_more_trials_go_on_behind_those_that_are_there(whole, tmp_path: Path) ->
     fewer, folder = tuned(tmp_path, trials=2, lockstep=2)
     stamps = {path: path.stat().st_mtime_ns for path in folder.glob("batches/0000/run/*.jsonl")}
     more, again = tuned(tmp_path, trials=4, lockstep=2)
-    assert again == folder and told(more)[:2] == told(fewer)
-    assert told(more) == told(whole[0])  # as if they had been asked for at once
+    assert again == folder and answers(more)[:2] == answers(fewer)
+    assert answers(more) == answers(whole[0])  # as if they had been asked for at once
     assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
 
 
@@ -121,7 +110,7 @@ def test_an_interrupted_search_ends_as_one_that_nobody_interrupted(
         with pytest.raises(Interrupted, match="continue with: sauna tune"):
             tuned(tmp_path, trials=4, lockstep=2)
     found, folder = tuned(tmp_path, trials=4, lockstep=2)
-    assert told(found) == told(whole[0])
+    assert answers(found) == answers(whole[0])
     for path in whole[1].glob("batches/*/run/metrics.jsonl"):
         assert (folder / path.relative_to(whole[1])).read_bytes() == path.read_bytes()
 
@@ -158,7 +147,7 @@ def test_a_trial_that_fails_is_shown_and_costs_the_others_nothing(
     monkeypatch.setattr(search, "train", fails)
     found, folder = tuned(tmp_path, trials=2, lockstep=2)
     good, bad = found["trials"]
-    assert (good["state"], good["return"]) == told(whole[0])[0][:2]
+    assert (good["state"], good["return"]) == answers(whole[0])[0][:2]
     assert bad["state"] == "fail" and "not finite" in bad["error"]
     text = (folder / "trials.txt").read_text()
     assert "failed: trial-1/0: the update of iteration 3 is not finite" in text

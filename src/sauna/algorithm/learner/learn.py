@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ from sauna.algorithm.learner.metrics import (
     variance_explained,
 )
 from sauna.algorithm.learner.optimizers import moves_rate
-from sauna.algorithm.learner.replay import pool_rows, remember, with_replayed
+from sauna.algorithm.learner.replay import as_if_now, pool_rows, remember, with_replayed
 from sauna.algorithm.learner.selected import Totals, needs_selection, update_on_selected
 from sauna.algorithm.learner.sequences import in_sequences
 from sauna.algorithm.learner.update import Parts, loss_advantage, update_on_all, vex_targets
@@ -46,15 +47,15 @@ def learn(
     explained = variance_explained(batch.return_, batch.value, batch.weight)
     replay, state = state.replay, state._replace(replay=())
     if parts.replay:
-        batch = with_replayed(
-            batch,
-            replay,
-            state.params,
-            hypers,
+        again = partial(
+            as_if_now,
+            params=state.params,
+            hypers=hypers,
             config=config,
             policy=parts.policy,
             target=parts.target,
         )
+        batch = with_replayed(batch, replay, again)
     if needs_selection(parts):
         state, totals = update_on_selected(state, batch, rollout, hypers, order, key, parts=parts)
         losses, gradient_norm, work = _means(totals, batch, rollout, parts)

@@ -14,6 +14,8 @@ step as one of pi: its ratio is against pi, and its policy term is multiplied by
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -60,24 +62,19 @@ def remember(replay: Replay, rollout: Rollout) -> Replay:
     return Replay(rollouts, jnp.minimum(replay.number + 1, len(rollouts.valid)))
 
 
-def with_replayed(
-    batch: Batch,
-    replay: Replay,
-    params: Array,
-    hypers: Hypers,
-    *,
-    config: Config,
-    policy: Policy,
-    target: VexTarget,
-) -> Batch:
-    """The new rollout's batch `[T * N]` and behind it those of the earlier ones: `[M]` rows."""
+def with_replayed(batch: Batch, replay: Replay, again: Callable[[Rollout], Batch]) -> Batch:
+    """The new rollout's batch `[T * N]` and behind it those of the earlier ones: `[M]` rows.
+
+    Args:
+      again: what an earlier rollout is today; see `as_if_now`.
+    """
 
     def one(numbered: tuple[Array, Rollout]) -> Batch:
         i, rollout = numbered
-        again = as_if_now(rollout, params, hypers, config=config, policy=policy, target=target)
-        return again._replace(weight=again.weight * (i < replay.number))
+        found = again(rollout)
+        return found._replace(weight=found.weight * (i < replay.number))
 
-    places = jnp.arange(config.replay_rollouts)
+    places = jnp.arange(len(replay.rollouts.valid))
     earlier = jax.lax.map(one, (places, replay.rollouts))
     new = batch._replace(importance=jnp.ones_like(batch.weight))
     return jax.tree.map(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.experiments.share.card import placed
-from sauna.experiments.share.export import export
+from sauna.experiments.share.export import check_empty, export
 from sauna.system import hub, run_directory
 from sauna.system.errors import BadInput
 from sauna.system.safe_read import JSON_BYTES, read_file
@@ -79,7 +79,4 @@ def pull(name: str, to: str | Path) -> Path:
       BadInput: the folder holds something, or the repository no policy.
       SaunaError: it cannot be had.
     """
-    folder = Path.cwd() / to
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise BadInput(f"to: {folder} is not empty")
-    return hub.download(name, folder)
+    return hub.download(name, check_empty(Path.cwd() / to))

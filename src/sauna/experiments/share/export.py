@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import secrets
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,7 @@ from sauna.experiments.share.policy_graph import policy_graph
 from sauna.experiments.share.same import check_same, numpy_policy, observations_of, onnx_policy
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
-from sauna.system.safe_write import sync_folder, write_durably
+from sauna.system.safe_write import new_folder, write_durably
 from sauna.system.working_folder import kept_folder
 from sauna.training.artifact import (
     EXPORT_FORMAT,
@@ -90,9 +88,7 @@ def export(
       BadInput: no such run or member, a folder that holds something, a policy of a kind that cannot
         be written as asked; nothing was created.
     """
-    folder = Path.cwd() / to
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise BadInput(f"to: {folder} is not empty")
+    folder = check_empty(Path.cwd() / to)
     if episodes < 0 or seed < 0:
         raise BadInput("episodes: must be at least 0, as seed")
     path = locate(run).folder
@@ -110,7 +106,11 @@ def export(
         manifest = _manifest(path, artifact, name, best)
         manifest |= {"sha256": hashlib.sha256(blob).hexdigest(), "bytes": len(blob)}
         manifest["env_spaces"] = [str(env.observation_space), str(env.action_space)]
-        with _new_folder(folder) as new:
+        with ExitStack() as stack:
+            try:
+                new = stack.enter_context(new_folder(folder))
+            except OSError as error:
+                raise BadInput(f"to: cannot make {folder}: {error.strerror}") from error
             write_durably(new / STATE, blob)
             if onnx or numpy:
                 _forms(new, artifact, policy, env, best, onnx, numpy)
@@ -121,6 +121,17 @@ def export(
             write_durably(new / "README.md", card(manifest, new).encode())
     finally:
         close(env)
+    return folder
+
+
+def check_empty(folder: Path) -> Path:
+    """Refuses a folder that holds something.
+
+    Raises:
+      BadInput: it does, or is no folder.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise BadInput(f"to: {folder} is not empty")
     return folder
 
 
@@ -204,21 +215,3 @@ def _forms(
         write_durably(folder / "numpy" / STATE, save(graph.constants))
         write_durably(folder / "numpy" / "policy.py", to_numpy(graph, title).encode())
         check_same("numpy", policy, numpy_policy(folder / "numpy" / "policy.py", graph), seen)
-
-
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """A folder beside `path` that takes its place at the end; none is left if the body raises."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.writing")
-        temporary.mkdir()
-    except OSError as error:
-        raise BadInput(f"to: cannot make {path}: {error.strerror}") from error
-    try:
-        yield temporary
-        sync_folder(temporary)
-        temporary.replace(path)  # also of an empty one
-        sync_folder(path.parent)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sauna.config.presets import RunConfig, resolve_run
 from sauna.config.settings import Config, fields_with
+from sauna.experiments.tune.plan import Plan
 from sauna.system.errors import BadInput
 from sauna.training import run as runs
 from sauna.training.coordinator import Callback
@@ -17,6 +18,24 @@ from sauna.training.prepare import Prepared, examine, place
 from sauna.training.train import train_run
 
 CHECKPOINTS = 10  # of a trial, if nobody says how often
+
+
+class Tuning(NamedTuple):
+    """What a search or a population works on.
+
+    Attributes:
+      plan: what is searched.
+      start: what every trial or member starts from, prepared.
+      folder: of the tuning.
+      display: makes what shows a training.
+      accept_changed_code: continue runs whose code is not what it was.
+    """
+
+    plan: Plan
+    start: Prepared
+    folder: Path
+    display: Callable[[], Display]
+    accept_changed_code: bool = False
 
 
 def joined(settings: Mapping[str, Mapping[str, Any]], seeds: Sequence[int]) -> RunConfig:

@@ -10,6 +10,7 @@ from typing import Any
 from sauna.config.trust import seal
 from sauna.experiments.study.results import typed
 from sauna.experiments.tune import fresh, results, storage
+from sauna.experiments.tune.batch import Tuning
 from sauna.experiments.tune.plan import PRUNERS, SEARCHES, Plan, make_plan
 from sauna.experiments.tune.population import Population, check_population
 from sauna.experiments.tune.search import Search
@@ -19,7 +20,6 @@ from sauna.system.errors import BadInput, Interrupted
 from sauna.system.signals import handled
 from sauna.system.working_folder import kept_folder
 from sauna.training.display import Display, make_display
-from sauna.training.prepare import Prepared
 
 # The options of a tuning besides the settings of its trials, with their defaults.
 OPTIONS: dict[str, Any] = {
@@ -57,7 +57,7 @@ def tune(
         core.
       accept_changed_code: continue runs whose code is not what it was.
       display: makes what shows a training.
-      say: takes each line that is said.
+      say: is called with each line of the output.
       **options: see `OPTIONS`.
 
     Returns:
@@ -99,22 +99,13 @@ def tune(
             if plan.fresh and (note := fresh.unfit_preset(plan)):
                 say(f"note: {note}")
             say(_opening(plan, place))
-            how = jobs, accept_changed_code, display, say
-            return _tune(plan, start, place, command, *how), place
+            tuning = Tuning(plan, start, place, display, accept_changed_code)
+            return _tune(tuning, command, jobs, say), place
 
 
-def _tune(
-    plan: Plan,
-    start: Prepared,
-    place: Path,
-    command: str,
-    jobs: int,
-    accept_changed_code: bool,
-    display: Callable[[], Display],
-    say: Callable[[str], None],
-) -> dict[str, Any]:
-    searching = Population if plan.exchange_every else Search
-    search = searching(plan, start, place, display, accept_changed_code)
+def _tune(tuning: Tuning, command: str, jobs: int, say: Callable[[str], None]) -> dict[str, Any]:
+    plan, place = tuning.plan, tuning.folder
+    search = (Population if plan.exchange_every else Search)(tuning)
     try:
         with handled(_raise):
             search.run()
@@ -123,7 +114,7 @@ def _tune(
         number = error.signal_number if isinstance(error, Interrupted) else 2
         raise Interrupted(number, f"stopped; continue with: {command}") from None
     written = results.write(plan, search, place, command)
-    how = {"jobs": jobs, "accept_changed_code": accept_changed_code}
+    how = {"jobs": jobs, "accept_changed_code": tuning.accept_changed_code}
     if plan.finalists > 1:
         fresh.try_finalists(plan, written["trials"], place, command, **how)
         written = results.write(plan, search, place, command)

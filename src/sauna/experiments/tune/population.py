@@ -17,7 +17,7 @@ import dataclasses
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,13 +26,12 @@ import numpy as np
 from sauna.config.presets import RunConfig
 from sauna.config.settings import FIELDS, to_json
 from sauna.config.stored import read_stored, to_stored
-from sauna.experiments.tune.batch import prepared_batch, train
+from sauna.experiments.tune.batch import Tuning, prepared_batch, train
 from sauna.experiments.tune.plan import Plan
 from sauna.experiments.tune.space import Range, Space, as_choice, start_of
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.system.safe_write import own_folder, replace_file
-from sauna.training.display import Display
 from sauna.training.prepare import Prepared
 
 FOLDER, LOG = "population", "exchanges.jsonl"
@@ -109,27 +108,12 @@ def check_population(plan: Plan, start: Prepared) -> None:
 
 
 class Population:
-    """A population of a plan in a folder.
+    """A population of a plan in a folder."""
 
-    Args:
-      plan: what is searched; its trials are the members.
-      start: what every member starts from, prepared.
-      folder: of the tuning.
-      display: makes what shows a training.
-      accept_changed_code: continue a run whose code is not what it was.
-    """
-
-    def __init__(
-        self,
-        plan: Plan,
-        start: Prepared,
-        folder: Path,
-        display: Callable[[], Display],
-        accept_changed_code: bool = False,
-    ) -> None:
+    def __init__(self, tuning: Tuning) -> None:
+        plan, start, folder, self._display, self._accept = tuning
         self._plan, self._start = plan, start
         self._folder, self._run = folder / FOLDER, folder / FOLDER / "run"
-        self._display, self._accept = display, accept_changed_code
         self._space, self._samples = plan.space, samples_of(start)
         self._every = iterations_between(plan, start)
 

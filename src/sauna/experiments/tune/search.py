@@ -7,20 +7,19 @@ batches/0003/trial-14       the same of one trial, of a batch whose run failed
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sauna.experiments.tune import storage
-from sauna.experiments.tune.batch import prepared_batch, train
+from sauna.experiments.tune.batch import Tuning, prepared_batch, train
 from sauna.experiments.tune.plan import Plan
 from sauna.experiments.tune.space import Space, settings_of, start_of
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.safe_write import own_folder
-from sauna.training.display import Display
 from sauna.training.prepare import Prepared
 
 if TYPE_CHECKING:
@@ -37,26 +36,11 @@ def arm_of(number: int) -> str:
 
 
 class Search:
-    """Trials of a plan in a folder.
+    """Trials of a plan in a folder."""
 
-    Args:
-      plan: what is searched.
-      start: what every trial starts from, prepared.
-      folder: of the tuning.
-      display: makes what shows a batch.
-      accept_changed_code: continue runs whose code is not what it was.
-    """
-
-    def __init__(
-        self,
-        plan: Plan,
-        start: Prepared,
-        folder: Path,
-        display: Callable[[], Display],
-        accept_changed_code: bool = False,
-    ) -> None:
+    def __init__(self, tuning: Tuning) -> None:
+        plan, start, folder, self._display, self._accept = tuning
         self._plan, self._start, self._folder = plan, start, folder
-        self._display, self._accept = display, accept_changed_code
         self._space: Space = plan.space
         self._forget_half_asked()
         self.study = storage.open_study(folder, plan)

@@ -16,12 +16,12 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sauna.config.checks import is_read
-from sauna.config.settings import FIELDS, TYPES, Config, fields_with, parse
+from sauna.config.settings import FIELDS, TYPES, Config, parse
 from sauna.config.trust import check_trusted
 from sauna.system.errors import BadInput, nearest
 from sauna.system.safe_read import JSON_BYTES, Untrusted, read_file
@@ -244,8 +244,3 @@ def traced(space: Space) -> Space:
 def shown(value: Any) -> str:
     """Writes a value for a table."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def free_names(extra: Sequence[str] = ()) -> tuple[str, ...]:
-    """Names the settings that a tuning takes as options: not those that it decides itself."""
-    return tuple(n for n in FIELDS if n not in (*fields_with("decided_by_study"), *extra))
