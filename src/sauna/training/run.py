@@ -104,7 +104,7 @@ def start(
 
     Args:
       overrides: the settings that a user gives.
-      display: what is said goes there.
+      display: prints the lines.
       found: what is known of the environment already.
       trust: the code that the run of `init_from` names may be another user's.
 

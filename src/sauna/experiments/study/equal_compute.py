@@ -14,8 +14,9 @@ from sauna.experiments.study.cells import Cell
 ABOUT = (
     "Learner compute is the number of samples through the gradient. The ratio is that of the first "
     "points where the two mean curves reach the baseline's mean final return. The interval is a "
-    "percentile bootstrap over seeds, too narrow with few of them; no verdict rests on it. Nothing "
-    "is said if the baseline has one seed, or a return that has not risen by more than its noise. "
+    "percentile bootstrap over seeds, too narrow with few of them; no verdict rests on it. No "
+    "ratio is given if the baseline has one seed, or if its return has not risen by more than its "
+    "noise. "
     "CPU seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
 WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "learner CPU seconds"}
@@ -80,7 +81,7 @@ def _verdict(cell: Cell, base: Cell, ratios: dict[str, Ratio], text: str) -> dic
 def _flat(base: Cell) -> str:
     return (
         f"{base.label}: its return on {base.task} has not risen above its start by more than its "
-        "noise, so nothing is said of compute."
+        "noise, so no ratio of compute is given."
     )
 
 

@@ -17,7 +17,7 @@ from sauna.system.logs import damage_of
 def check_same_code(
     units: list[Unit], folder: Path, accept: bool, say: Callable[[str], None]
 ) -> None:
-    """Refuses to take results of other code for those of today's; a newer version is said.
+    """Refuses to take results of other code for those of today's; a newer version is named.
 
     Args:
       accept: the user has said that they count as today's; the runs note both.
