@@ -2,8 +2,8 @@
 
     python results/make.py             docs and figures from the result files
     python results/make.py --collect   takes what the studies in runs/ have found so far, first
-    python results/make.py --train     trains first (many hours), continuing where it stopped; a task
-                                        that a result file holds whole is not trained again
+    python results/make.py --train     trains first (many hours), continuing where it stopped;
+                                       a task that a result file holds whole is not trained again
 
 The runs stay in `runs/`, which is not in the repository; what is committed is each member's final
 numbers and a thinned curve.
