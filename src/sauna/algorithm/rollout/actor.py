@@ -1,8 +1,9 @@
 """How the members of a process choose actions at each vector step.
 
-Acting needs the policy head alone: log-probabilities, values and Vex are computed afterwards for a
-whole segment (`Program.score`). For an MLP the few small products are a loop of our own, because a
-call of a JAX program costs more than they do; another network acts by such a call.
+For an MLP the few small products are a loop of our own, because a call of a JAX program costs more
+than they do. Acting needs the policy head alone: log-probabilities, values and Vex are computed
+afterwards for a whole segment (`Program.score`). Another network acts by a call of a JAX program,
+which gives these scores as well: a second pass through a CNN would take as long as the first.
 """
 
 from __future__ import annotations
@@ -28,7 +29,15 @@ _TANH, _RELU, _ELU, _GELU, _LEAKY_RELU, _SELU, _SIGMOID = range(7)  # places in 
 
 
 class Actor(Protocol):
-    """Chooses the actions of P members."""
+    """Chooses the actions of P members.
+
+    Attributes:
+      gives_scores: whether `scores` holds log-probability, value and Vex `[P, N, 3]` of the last
+        actions; otherwise they have to be computed afterwards.
+    """
+
+    gives_scores: bool
+    scores: np.ndarray
 
     def load(self, params: np.ndarray) -> None:
         """Takes over the parameters `[P, D]` of the coming rollout."""
@@ -48,9 +57,12 @@ class Actor(Protocol):
 class CompiledActor:
     """Acts by `Program.act`, whatever the network is."""
 
+    gives_scores = True
+
     def __init__(self, act: Any) -> None:
         self._act = act
         self._params: Any = None
+        self.scores = np.zeros(0)
 
     def load(self, params: np.ndarray) -> None:
         import jax.numpy as jnp
@@ -61,11 +73,15 @@ class CompiledActor:
         return noise
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        return np.asarray(self._act(self._params, observation, noise))
+        action, scores = self._act(self._params, observation, noise)
+        self.scores = np.asarray(scores)
+        return np.asarray(action)
 
 
 class RecurrentActor(CompiledActor):
     """Acts by `Program.act` with the states of `memory`, and moves them on."""
+
+    gives_scores = False
 
     def __init__(self, act: Any, memory: HostMemory) -> None:
         super().__init__(act)
@@ -83,6 +99,9 @@ class MLPActor:
     Each layer's weights have a last row, the biases. Layers that are normalised have two rows in
     `_norms`, scales and biases; others have none.
     """
+
+    gives_scores = False
+    scores = np.zeros(0)
 
     def __init__(self, config: Config, spaces: Spaces, policy: Policy, members: int) -> None:
         self._policy, self._sample = policy, _sampler(config, spaces)
