@@ -227,14 +227,15 @@ class HostCollector:
         observations = self._observed
         self._memory.acting = acting
         waits, bounded = self._envs.waiting is not None, policy.distribution.bounded
+        hold, scored = policy.hold, actor.gives_scores
         actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
             if waits:
                 self._memory.acting = acting & ~self._waiting()
                 self._note_idle(row, acting)
-            own = noise[row % block // policy.hold]
+            own = noise[row % block // hold]
             actions[row] = action = actor.act(observations[row], own)
-            if actor.gives_scores:
+            if scored:
                 self._write_scores((slice(None), row), actor.scores)
             shown = to_env(policy.distribution, action) if bounded else action
             step = self._envs.step(shown.reshape(-1, width), active)
