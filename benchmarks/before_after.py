@@ -45,6 +45,7 @@ def measure(name: str, before: Path, after: Path, rounds: int) -> dict[str, Any]
         "cpu_seconds_before": statistics.median(found["before"]),
         "cpu_seconds_after": statistics.median(found["after"]),
         "after_over_before": statistics.median(ratios),
+        "least_after_over_least_before": min(found["after"]) / min(found["before"]),
         "middle_half": [ratios[quarter], ratios[-1 - quarter]],
     }
 

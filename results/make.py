@@ -2,7 +2,8 @@
 
     python results/make.py             docs and figures from the result files
     python results/make.py --collect   takes what the studies in runs/ have found so far, first
-    python results/make.py --train     trains first (many hours), continuing where it stopped
+    python results/make.py --train     trains first (many hours), continuing where it stopped;
+                                       a task that a result file holds whole is not trained again
 
 The runs stay in `runs/`, which is not in the repository; what is committed is each member's final
 numbers and a thinned curve.
@@ -12,11 +13,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +37,8 @@ from zoo_page import draw_zoo, zoo_page
 
 from sauna.experiments.report.figures import draw_plots, write_figures
 from sauna.experiments.report.page import rounded
-from sauna.experiments.study.results import gather
-from sauna.experiments.study.spec import load_spec
+from sauna.experiments.study.results import cell_command, gather
+from sauna.experiments.study.spec import Spec, load_spec
 from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.units import units_of
 
@@ -56,7 +59,10 @@ def train(name: str) -> None:
     Raises:
       SystemExit: it was interrupted.
     """
-    command = [sys.executable, "-m", "sauna", "study", name, "--out", "runs"]
+    study = remaining(name)
+    if study is None:
+        return
+    command = [sys.executable, "-m", "sauna", "study", str(study), "--out", "runs"]
     code = subprocess.run(command).returncode
     if code in (130, 143) or code < 0:
         sys.exit(code)
@@ -64,10 +70,38 @@ def train(name: str) -> None:
         print(f"{name}: exit code {code}", flush=True)
 
 
+def remaining(name: str) -> Path | str | None:
+    """The study without those tasks that `results/NAME.json` holds whole; None if it holds all.
+
+    So a study of many tasks can be trained on several machines, or without the runs of before.
+    """
+    spec, stored = load_spec(name), load(name)
+    if name in MEASURED or not stored or (ROOT / "runs" / name).exists():
+        return name
+    trained = {(cell["task"], cell["label"]): len(cell["members"]) for cell in stored["cells"]}
+    tasks = [
+        task
+        for task in spec.tasks
+        if any(
+            trained.get((task, arm.label), 0) < len(arm.seeds)
+            for arm in spec.arms
+            if task in arm.tasks
+        )
+    ]
+    if len(tasks) in (0, len(spec.tasks)):
+        return name if tasks else None
+    path = ROOT / "runs" / f"{name}.toml"
+    path.parent.mkdir(exist_ok=True)
+    text = (resources.files("sauna.experiments.study.studies") / f"{name}.toml").read_text()
+    path.write_text(re.sub(r"^tasks = .*$", f"tasks = {json.dumps(tasks)}", text, flags=re.M))
+    return path
+
+
 def collect(name: str) -> None:
     """`results/NAME.json` from what `runs/` holds of the study: finished members, thinned curves.
 
-    The study may still be running, or have been interrupted.
+    The study may still be running, or have been interrupted. Cells that `runs/` does not hold stay
+    as they are in the file.
     """
     stored = ROOT / "runs" / name / "study.json"
     if not stored.exists():
@@ -82,8 +116,43 @@ def collect(name: str) -> None:
         return
     for cell in results["cells"]:
         del cell["config"]  # the command says what differs from the preset
+    results = merged(load(name) or {}, results, spec)
     text = json.dumps(results, separators=(",", ":"))
     (ROOT / "results" / f"{name}.json").write_text(text.replace('{"task"', '\n{"task"') + "\n")
+
+
+def merged(old: dict[str, Any], new: dict[str, Any], spec: Spec) -> dict[str, Any]:
+    """`new` with the cells of `old` that it lacks, in the order of the study.
+
+    A cell of settings that the study no longer has is left out.
+    """
+    cells = {
+        (cell["task"], cell["label"]): cell
+        for cell in (*old.get("cells", ()), *new["cells"])
+        if _is_of(spec, cell)
+    }
+    order = [(task, arm.label) for task in spec.tasks for arm in spec.arms]
+    made_with = {key: _each(old.get(key, []), new[key]) for key in ("versions", "machine", "git")}
+    return {**new, **made_with, "cells": [cells[key] for key in order if key in cells]}
+
+
+def _each(*found: Any) -> Any:
+    """Each value of several once, in a list; one value alone stands without a list."""
+    values: list[Any] = []
+    for given in found:
+        for value in given if isinstance(given, list) else [given]:
+            if value not in values:
+                values.append(value)
+    return values[0] if len(values) == 1 else values
+
+
+def _is_of(spec: Spec, cell: dict[str, Any]) -> bool:
+    """Whether a study still has a cell's arm, with the settings that it was trained with."""
+    return any(
+        cell["command"] == cell_command(arm, cell["task"])
+        for arm in spec.arms
+        if arm.label == cell["label"] and cell["task"] in arm.tasks
+    )
 
 
 def _thinned(cell: dict[str, Any], names: tuple[str, ...], points: int) -> dict[str, Any]:

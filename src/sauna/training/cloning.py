@@ -147,8 +147,8 @@ def _split(data: Demonstrations, config: Config, moments: Moments | None) -> _Sp
         return normalize(moments, raw, config.clip_observations).astype(np.float32)
 
     reward, rewards = _rewards(data, config)
-    goes_on = ~data.terminated & (config.truncation == "bootstrap")
-    returns, discount = returns_to_go(reward, data.length, goes_on, config.gamma)
+    bootstrap = ~data.terminated & (config.truncation == "bootstrap")
+    returns, discount = returns_to_go(reward, data.length, bootstrap, config.gamma)
     observation, final = seen(data.observation), seen(data.final)
     is_held = np.arange(len(data.length)) % HELD_OUT == HELD_OUT - 1
     is_held[-1] |= not is_held.any()

@@ -1,4 +1,4 @@
-"""Which environment and checkpoint an evaluation plays, for how long, and what it films."""
+"""Which environment and checkpoint an evaluation plays, for how long, and what it records."""
 
 from __future__ import annotations
 

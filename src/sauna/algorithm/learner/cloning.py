@@ -150,20 +150,20 @@ def clone_order(number: int, seed: int, epoch: int) -> np.ndarray:
 
 
 def returns_to_go(
-    reward: np.ndarray, length: np.ndarray, goes_on: np.ndarray, gamma: float
+    reward: np.ndarray, length: np.ndarray, bootstrap: np.ndarray, gamma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """`G_t = r_t + gamma G_{t+1}` up to the end of each episode, and the discount of what follows.
 
     Args:
       reward: `[M]` of `E` episodes, one behind the other.
       length: `[E]` env steps of each.
-      goes_on: `[E]` whether the value goes on behind its end.
+      bootstrap: `[E]` whether its last value is bootstrapped.
 
     Returns:
       `G [M]` and `gamma^(steps left) [M]`, which is 0 if nothing goes on; float64.
     """
     returns, discounts, end = np.zeros(len(reward)), np.zeros(len(reward)), 0
-    for steps, more in zip(length.tolist(), goes_on.tolist(), strict=True):
+    for steps, more in zip(length.tolist(), bootstrap.tolist(), strict=True):
         start, end, sum_ = end, end + steps, 0.0
         for t in range(end - 1, start - 1, -1):
             sum_ = float(reward[t]) + gamma * sum_

@@ -1,4 +1,4 @@
-"""Environments whose rows are stepped together: a vector environment, or agents of one world."""
+"""Environments whose rows are stepped together: a vector environment, or several agents."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def evaluate(
         )
         path = written / "videos" / f"{label}.mp4"
         how = deterministic, seed, max_steps, best
-        say(f"{chosen[0]}: filming one episode, which can take minutes")
+        say(f"{chosen[0]}: recording one episode, which can take minutes")
         try:
             record_video(path, artifact, chosen[0], result["env"], kwargs, *how)
         except SaunaError as error:

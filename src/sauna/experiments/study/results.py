@@ -72,8 +72,6 @@ def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
 def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any]:
     config = to_json(check(arm, task))
     members = [m for unit in units for m in _members(unit, folder, config["steps"])]
-    flags = {**arm.settings, "arm": arm.arm, "seeds": arm.seeds}
-    text = " ".join(typed(key, value) for key, value in flags.items())
     return {
         "task": task,
         "label": arm.label,
@@ -81,10 +79,17 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
         "baseline": arm.baseline,
         "preset": config["preset"],
         "config": config,
-        "command": f"sauna train {shlex.quote(task)} {text}",
+        "command": cell_command(arm, task),
         "git": _made_with(units, folder)["git"],
         "members": sorted(members, key=lambda member: arm.seeds.index(member["seed"])),
     }
+
+
+def cell_command(arm: Arm, task: str) -> str:
+    """Returns what a user types to train the members of one arm on one task."""
+    flags = {**arm.settings, "arm": arm.arm, "seeds": arm.seeds}
+    text = " ".join(typed(key, value) for key, value in flags.items())
+    return f"sauna train {shlex.quote(task)} {text}"
 
 
 def typed(name: str, value: Any) -> str:
