@@ -46,8 +46,13 @@ class Place:
             stderr=subprocess.PIPE,
         )
 
+    def runs(self, started: subprocess.Popen[str]) -> bool:
+        """Whether it still runs; what it said is shown if not."""
+        assert started.poll() is None, started.communicate()
+        return True
+
     def finish(self, started: subprocess.Popen[str], code: int = 0) -> str:
-        out, errors = started.communicate(timeout=300)
+        out, errors = started.communicate(timeout=900)
         assert started.returncode == code, out + errors
         return out + errors
 
@@ -95,6 +100,7 @@ def on_ray(path: Path, patched: pytest.MonkeyPatch) -> Iterator[Place]:
         "PYTHONPATH": environment()["PYTHONPATH"],
         "RAY_TMPDIR": short,
         "TMPDIR": str(path / "nodes"),
+        "RAY_worker_niceness": "0",  # Ray's own is 15: beside other work a unit would starve
         "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN_PATH": str(path / "token"),
     }.items():
@@ -103,7 +109,7 @@ def on_ray(path: Path, patched: pytest.MonkeyPatch) -> Iterator[Place]:
     shutil.rmtree(short, ignore_errors=True)
 
 
-def until(true: Callable[[], Any], seconds: float = 120) -> None:
+def until(true: Callable[[], Any], seconds: float = 300) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "waited in vain"
