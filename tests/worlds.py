@@ -521,6 +521,22 @@ class Parts(World):
         return {"hand": hand, "speed": np.array([0.5, -0.5], np.float32)}
 
 
+class Camera(World):
+    """A picture beside two numbers."""
+
+    observation_space = spaces.Dict(
+        {
+            "picture": spaces.Box(0, 255, (36, 36, 1), np.uint8),
+            "speed": spaces.Box(-1, 1, (2,), np.float32),
+        }
+    )
+    length = 4
+
+    def observe(self) -> Any:
+        picture = np.full((36, 36, 1), 40 * self.t, np.uint8)
+        return {"picture": picture, "speed": np.array([0.5, 0.1 * self.t], np.float32)}
+
+
 class Choosy(World):
     """Takes valid actions alone, and raises at any other; which are valid changes at random.
 

@@ -264,8 +264,8 @@ def _train(values: dict[str, Any]) -> None:
     from sauna.training.pick import pick
 
     trust = values.pop("trust")
-    stored = _overrides_in(values.pop("config"), trust)
-    env = values.pop("env")
+    file, env = values.pop("config"), values.pop("env")
+    stored = _overrides_in(file, trust)
     picked = pick(_over(stored, values | ({"env": env} if env else {})))
     overrides = translate(picked.overrides)
     display = make_display()
@@ -274,7 +274,7 @@ def _train(values: dict[str, Any]) -> None:
         return
     run = runs.start(overrides, display, picked.found, trust)
     if picked.said:
-        display.say(picked.said)
+        display.say(f"the settings of {file} over {picked.said}" if stored else picked.said)
     train_and_draw(run, display, resume=False)
     curve = run.path / "figures" / "learning_curve.png"
     print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")

@@ -25,6 +25,7 @@ from sauna.algorithm.rollout.program import decide as decide_segment
 from sauna.algorithm.selection.registry import make_filter
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep
 from sauna.config.settings import Config
+from sauna.envs.wrapping import PLAIN
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.inspect.decisions import advantages, decide
 from sauna.experiments.inspect.inspection import (
@@ -34,7 +35,14 @@ from sauna.experiments.inspect.inspection import (
     principal_components,
 )
 from sauna.experiments.inspect.page import meaning
-from sauna.experiments.inspect.recording import MAX_FRAMES, SIDE, Frames, Recorder, _played
+from sauna.experiments.inspect.recording import (
+    MAX_FRAMES,
+    SIDE,
+    Frames,
+    Recorder,
+    _played,
+    open_env,
+)
 from sauna.experiments.inspect.streams import scaled, stream_of
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
@@ -326,6 +334,14 @@ def test_what_cannot_be_drawn_is_said_in_one_line(run, monkeypatch, how) -> None
     assert len(said) == 1 and said[0].startswith("no frames: ") and "\n" not in said[0]
     text = path.read_text()
     assert "There are no frames." in text and "<img" not in text
+
+
+def test_agents_are_refused_before_anything_is_said_of_frames() -> None:
+    said: list[str] = []
+    for frames in (True, False):
+        with pytest.raises(BadInput, match="a page shows one agent"):
+            open_env("vector_worlds:Agents", {}, PLAIN, frames, said.append)
+    assert said == []
 
 
 def test_bad_input_creates_nothing(run, tmp_path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -83,3 +84,8 @@ def test_both_interfaces_pick_and_say_so(monkeypatch, capsys, tmp_path) -> None:
     sauna.train("CartPole-v1", preset="mujoco", quiet=True)
     assert started[-1] == {"env": "CartPole-v1", "preset": "mujoco"}
     assert "preset" not in capsys.readouterr().out
+    file = tmp_path / "tuned.json"
+    file.write_text(json.dumps({"env": "CartPole-v1", "preset": "auto", "gamma": 0.9}))
+    cli.main(["train", "--config", str(file)])
+    expected = f"the settings of {file} over preset cartpole for CartPole-v1 (RL Zoo's numbers)"
+    assert expected in capsys.readouterr().out and started[-1]["gamma"] == 0.9

@@ -13,8 +13,8 @@ import sauna
 from helpers import SMALL
 from sauna import cli
 from sauna.config.presets import resolve
-from sauna.experiments.share.card import command
-from sauna.system import run_directory
+from sauna.experiments.share.card import FILES, command
+from sauna.system import hub, run_directory
 from sauna.system.checkpoint import BadCheckpoint, NewerFormat
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
@@ -149,6 +149,17 @@ def test_code_that_somebody_elses_names_does_not_run(policy: Path, tmp_path: Pat
     evil = {**stored["config"], "env": "evil_of_somebody:thing"}
     with pytest.raises(BadInput, match=r"names code that would run.*evil_of_somebody.*--trust"):
         sauna.load(changed(policy, tmp_path / "evil", config=evil))
+
+
+def test_the_command_names_every_file(run: Path, tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "listed"
+    cli.main(["export", str(run), "--to", str(folder), "--numpy", "--episodes", "0"])
+    first, *lines = capsys.readouterr().out.splitlines()
+    written = {str(path.relative_to(folder)) for path in folder.rglob("*.*") if path.is_file()}
+    written -= {name for name in written if "__pycache__" in name}
+    assert first == f"policy: {folder}" and {line.split()[0] for line in lines} == written
+    assert all(len(line.split()) > 2 for line in lines)
+    assert set(FILES) == set(hub.FILES)
 
 
 @pytest.mark.parametrize(

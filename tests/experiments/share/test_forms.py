@@ -1,4 +1,4 @@
-"""ONNX and numpy forms act as the policy does, for each kind of observation, network and action."""
+"""ONNX and numpy forms act as the policy does, for each kind of numbers, network and action."""
 
 from __future__ import annotations
 
@@ -7,33 +7,27 @@ import dataclasses
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import flax.linen as nn
-import jax
 import numpy as np
 import pytest
 from gymnasium import spaces as gym
-from safetensors.numpy import save
 
 from helpers import configured
+from policy_forms import made, numpy_file, sampled
 from sauna.algorithm.policy.frozen import FrozenPolicy
-from sauna.algorithm.policy.normalize import Moments
 from sauna.config.choices import ACTIVATIONS
-from sauna.config.settings import Config
 from sauna.envs.masked import MaskedSpace
-from sauna.envs.spaces import describe
 from sauna.experiments.share.graph import Graph
+from sauna.experiments.share.layers_graph import activated
 from sauna.experiments.share.numpy_file import to_numpy
 from sauna.experiments.share.onnx_file import to_onnx
-from sauna.experiments.share.policy_graph import _activated, policy_graph
+from sauna.experiments.share.policy_graph import policy_graph
 from sauna.experiments.share.same import check_same, numpy_policy, onnx_policy
 from sauna.system.errors import BadInput, SaunaError
-from sauna.training.loop.member_state import named_params
 
 MANY = 1000  # observations
 INF = np.inf
@@ -47,7 +41,6 @@ NESTED = gym.Dict(
         "it's": gym.MultiBinary(2),
     }
 )
-BYTES = gym.Box(0, 255, (3, 38, 36), np.uint8)
 # Each kind of observation, network and action at least once: (observations, actions, settings).
 KINDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     "normalised, tanh, clipped": (BOX, gym.Box(-0.3, 0.3, (2,)), {"normalize": True}),
@@ -79,58 +72,20 @@ KINDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
     "nested, choices": (NESTED, gym.MultiDiscrete([2, 4]), {"normalize": True}),
     "bits": (gym.MultiDiscrete([3, 2]), gym.MultiBinary(3), {}),
     "board, flattened": (gym.Box(0, 4, (3, 3, 2), np.uint8), gym.Discrete(4), {}),
-    "pictures": (BYTES, gym.Discrete(4), {"network": "nature-cnn", "trunk": "shared"}),
-    "last channel, box": (gym.Box(0, 1, (36, 36), np.uint8), BOUNDED, {"network": "nature-cnn"}),
 }
 
 
 @cache
 def policy_of(kind: str) -> tuple[FrozenPolicy, Graph, Any]:
     """A policy with random weights, the graph of it, and its observation space."""
-    observed, acted, settings = KINDS[kind]
-    settings = {"hidden": (16, 8), **settings}
-    normalised = settings.pop("normalize", False)
-    plain = dataclasses.replace(configured(), rescale_actions=False, network="mlp")
-    config = dataclasses.replace(plain, normalize_observations=normalised, **settings)
-    return made(config, observed, acted)
+    policy, graph = made(*KINDS[kind])
+    return policy, graph, KINDS[kind][0]
 
 
-def made(config: Config, observed: Any, acted: Any) -> tuple[FrozenPolicy, Graph, Any]:
-    spaces, random = describe(observed, acted), np.random.default_rng(0)
-    env = SimpleNamespace(observation_space=observed, action_space=acted)
-    policy = FrozenPolicy(config, spaces, env)
-    size = policy.policy.init(jax.random.key(0)).size
-    params = 0.3 * random.standard_normal(size).astype(np.float32)
-    moments = None
-    if config.normalize_observations:
-        length = spaces.normalized
-        variance = random.uniform(0.1, 3, length)
-        moments = Moments(random.standard_normal(length), variance, np.ones(1))
-    policy.load(params, moments)
-    arrays = {f"params/{k}": v for k, v in named_params(policy.policy, policy.params).items()}
-    if moments is not None:
-        arrays |= {f"observation_moments/{k}": v for k, v in moments._asdict().items()}
-    return policy, policy_graph(config, arrays, observed, acted), observed
-
-
-def sampled(space: Any, number: int) -> list[Any]:
-    space.seed(0)
-    return [space.sample() for _ in range(number)]
-
-
-DEFAULT = [kind for kind in KINDS if kind != "last channel, box"]
-EVERY = [*DEFAULT, pytest.param("last channel, box", marks=pytest.mark.slow)]  # it compiles long
-
-
-def number_of(kind: str) -> int:
-    """Of observations; pictures are many numbers each."""
-    return 30 if "nature-cnn" in KINDS[kind][2].values() else MANY
-
-
-@pytest.mark.parametrize("kind", EVERY)
+@pytest.mark.parametrize("kind", KINDS)
 def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
     policy, graph, space = policy_of(kind)
-    act, seen = numpy_file(graph, tmp_path), sampled(space, number_of(kind))
+    act, seen = numpy_file(graph, tmp_path), sampled(space, MANY)
     check_same("numpy", policy, act, seen)
     policy.reset()
     one = numpy_policy(tmp_path / "policy.py", graph)(seen[0])
@@ -140,17 +95,11 @@ def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
     assert len((tmp_path / "policy.py").read_text().splitlines()) <= 60
 
 
-def numpy_file(graph: Graph, folder: Path) -> Callable[[Any], Any]:
-    (folder / "policy.safetensors").write_bytes(save(graph.constants))
-    (folder / "policy.py").write_text(to_numpy(graph, "A policy."))
-    return numpy_policy(folder / "policy.py", graph)
-
-
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_each_activation_is_flaxs(name: str, tmp_path: Path) -> None:
     graph, x = Graph(), np.linspace(-4, 4, 81, dtype=np.float32)[:, None]
     graph.input("observation", (), (1,), np.float32)
-    graph.output("action", _activated(graph, "observation", name), (1,), np.float32)
+    graph.output("action", activated(graph, "observation", name), (1,), np.float32)
     np.testing.assert_allclose(
         numpy_file(graph, tmp_path)(x), getattr(nn, name)(x), rtol=1e-5, atol=1e-6
     )
@@ -161,7 +110,7 @@ def test_each_activation_is_flaxs(name: str, tmp_path: Path) -> None:
 def test_onnx_acts_as_the_policy(kind: str) -> None:
     pytest.importorskip("onnxruntime", reason="needs `pip install 'sauna-rl[onnx]'`")
     policy, graph, space = policy_of(kind)
-    for number in (number_of(kind), 1):
+    for number in (MANY, 1):
         act = onnx_policy(to_onnx(graph, kind), graph)
         check_same("onnx", policy, act, sampled(space, number))
 
@@ -185,7 +134,7 @@ def test_a_title_of_somebody_elses_ends_no_text(tmp_path: Path) -> None:
 
 def test_a_network_of_ones_own_is_refused() -> None:
     config = dataclasses.replace(configured(), network="own_networks:Net")
-    with pytest.raises(BadInput, match="network own_networks:Net; only mlp and nature-cnn are"):
+    with pytest.raises(BadInput, match="network: own_networks:Net is code of your own"):
         policy_graph(config, {}, BOX, gym.Discrete(2))
 
 

@@ -15,7 +15,6 @@ from sauna.algorithm.learner.program import make_learner
 from sauna.algorithm.types import Hypers, Rollout, ScoredStep, TrainState, member_keys
 from sauna.config.presets import Member
 from sauna.config.settings import Config
-from sauna.envs.host.parallel_envs import AgentsAsOne
 from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.policy import TrainedPolicy
@@ -82,8 +81,6 @@ def examine(
     config, iteration = member.config, int(manifest["iteration"])
     kwargs, around = json.loads(config.env_kwargs), wrapping_of(config)
     env, drawer = open_env(config.env, kwargs, around, frames, say)
-    if isinstance(env, AgentsAsOne):
-        raise BadInput("inspect: a page shows one agent; an environment of several cannot be shown")
     policy = TrainedPolicy(artifact, name, env)
     played = play_episodes(policy, env, episodes, deterministic, seed, drawer, max_steps, say)
     steps, steps_per_second = len(played.reward), frames_per_second(env)

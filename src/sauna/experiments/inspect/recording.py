@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sauna.algorithm.rollout.play import play
-from sauna.envs.host.answers import life_lost, one_number
+from sauna.envs.host.answers import close, life_lost, one_number
 from sauna.envs.host.contract import episode_seed
+from sauna.envs.host.parallel_envs import AgentsAsOne
 from sauna.envs.make import make_drawn_env, make_env
 from sauna.envs.wrapping import Wrapping
 from sauna.experiments.evaluate import MAX_STEPS
@@ -144,19 +145,26 @@ def open_env(
     """Returns the environment, and what draws it; where it cannot be drawn, one line says so.
 
     Raises:
-      BadInput: it cannot be made.
+      BadInput: it cannot be made, or is one of several agents.
     """
+    made, failed = None, ""
     if frames:
         chosen = dict(os.environ)
         choose_renderer()
         try:
-            env = make_drawn_env(env, kwargs, wrapping)
-            return env, Frames(env, say)
+            made = make_drawn_env(env, kwargs, wrapping)
         except BadInput as error:
             os.environ.clear()
             os.environ.update(chosen)  # a renderer that fails may also fail the plain environment
-            say(f"no frames: {not_drawn(error)}")
-    return make_env(env, kwargs, wrapping), None
+            failed = f"no frames: {not_drawn(error)}"
+    is_drawn = made is not None
+    made = made if is_drawn else make_env(env, kwargs, wrapping)
+    if isinstance(made, AgentsAsOne):
+        close(made)
+        raise BadInput("inspect: a page shows one agent; an environment of several cannot be shown")
+    if failed:
+        say(failed)
+    return made, Frames(made, say) if is_drawn else None
 
 
 def play_episodes(

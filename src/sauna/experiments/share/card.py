@@ -60,6 +60,14 @@ FORMS = {
     "policy.onnx": "`policy.onnx` is the same policy, from the raw observation to the action.",
     "numpy/policy.py": "`numpy/` is the same in a file that needs numpy and safetensors alone.",
 }
+FILES = {
+    "README.md": "the model card",
+    "policy.json": "settings, spaces, versions",
+    "policy.safetensors": "weights and normaliser",
+    "policy.onnx": "the whole policy, for ONNX Runtime",
+    "numpy/policy.py": "the whole policy, for numpy and safetensors alone",
+    "numpy/policy.safetensors": "the numbers of numpy/policy.py",
+}
 
 
 def card(manifest: Mapping[str, Any], folder: Path) -> str:
@@ -85,6 +93,13 @@ def card(manifest: Mapping[str, Any], folder: Path) -> str:
         action=_code(action),
         trained=_trained(manifest),
     )
+
+
+def listing(folder: Path) -> list[str]:
+    """Names each file of an exported policy, and says what it is, one a line."""
+    found = {name: text for name, text in FILES.items() if (folder / name).is_file()}
+    width = max(map(len, found), default=0)
+    return [f"  {name:<{width}}  {text}" for name, text in found.items()]
 
 
 def placed(text: str, place: str) -> str:

@@ -53,9 +53,11 @@ def export_from_flags(values: dict[str, Any]) -> None:
     Raises:
       BadInput: as `export`.
     """
+    from sauna.experiments.share.card import listing
     from sauna.experiments.share.export import export
 
-    print(f"policy: {export(**_read(values))}")
+    folder = export(**_read(values))
+    print("\n".join([f"policy: {folder}", *listing(folder)]))
 
 
 def _read(values: dict[str, Any]) -> dict[str, Any]:

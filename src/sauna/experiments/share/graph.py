@@ -1,6 +1,7 @@
 """What a policy computes, written down as a list of operations that ONNX and numpy both have.
 
-An operation has the name and the meaning of ONNX's. Every value has a leading batch axis `B`.
+An operation has the name and the meaning of ONNX's. Every value has a leading batch axis `B`. In
+place of ONNX's attributes some have plainer ones; `onnx_file` turns them back.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+
+ARGUMENTS = ("observation", "action_mask", "state")
 
 
 class Input(NamedTuple):
@@ -17,7 +20,7 @@ class Input(NamedTuple):
       keys: where it stands in a Dict or Tuple, `("arm", "angles")`; empty: the whole observation.
       shape: of one, without the batch axis.
       dtype: of numpy, as the environment's space has it.
-      argument: what it is a part of: `observation`, `action_mask` or `state`.
+      argument: what it is a part of, one of `ARGUMENTS`.
     """
 
     name: str
@@ -66,10 +69,15 @@ class Graph:
         self.inputs.append(Input(name, keys, shape, np.dtype(dtype).name, argument))
         return name
 
+    def name_of(self, keys: tuple[Any, ...]) -> str:
+        """Names the next part of the observation, which stands at `keys`."""
+        return f"observation_{len(self.inputs)}" if keys else "observation"
+
     @property
     def arguments(self) -> list[str]:
         """What the caller gives, in order: the observation, a mask, a state."""
-        return list(dict.fromkeys(part.argument for part in self.inputs))
+        given = {part.argument for part in self.inputs}
+        return [name for name in ARGUMENTS if name in given]
 
     def constant(self, name: str, array: Any) -> str:
         """Adds a constant array under a name that no other one has; returns the name."""

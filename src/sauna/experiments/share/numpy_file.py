@@ -14,7 +14,7 @@ OPERATIONS = {
     "Add": "{0} + {1}",
     "ArgMax": "np.argmax({0}, -1, keepdims=True)",
     "Cast": "{0}.astype(np.{to})",
-    "Conv": "conv({0}, {1}, {2}, ({strides}))",
+    "Conv": "conv({0}, {1}, {2}, {stride}, {pad})",
     "Div": "{0} / {1}",
     "Exp": "np.exp({0})",
     "Equal": "{0} == {1}",
@@ -23,6 +23,7 @@ OPERATIONS = {
     "LayerNormalization": "norm({0}, {1}, {2}, {epsilon})",
     "MatMul": "{0} @ {1}",
     "Max": "np.maximum({0}, {1})",
+    "MaxPool": "pool({0}, {before})",
     "Min": "np.minimum({0}, {1})",
     "Mul": "{0} * {1}",
     "Relu": "np.maximum({0}, 0)",
@@ -37,12 +38,20 @@ OPERATIONS = {
 }
 HELPERS = {
     "Conv": '''
-def conv(x, kernel, bias, strides):
-    """A convolution of x [B, C, H, W] without padding; kernel [F, C, K, K]."""
+def conv(x, kernel, bias, stride, pad):
+    """A convolution of x [B, C, H, W] with zeros around it; kernel [F, C, K, K]."""
+    x = np.pad(x, ((0, 0), (0, 0), (pad, pad), (pad, pad)))
     windows = np.lib.stride_tricks.sliding_window_view(x, kernel.shape[2:], (2, 3))
-    windows = windows[:, :, :: strides[0], :: strides[1]]
-    products = np.tensordot(windows, kernel, ((1, 4, 5), (1, 2, 3)))
+    products = np.tensordot(windows[:, :, ::stride, ::stride], kernel, ((1, 4, 5), (1, 2, 3)))
     return (products + bias).transpose(0, 3, 1, 2)
+
+''',
+    "MaxPool": '''
+def pool(x, above, left):
+    """The largest of 3 x 3 pixels of x [B, C, H, W], moved by two pixels."""
+    x = np.pad(x, ((0, 0), (0, 0), (above, 1), (left, 1)), constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(x, (3, 3), (2, 3))
+    return windows[:, :, ::2, ::2].max((-1, -2))
 
 ''',
     "LayerNormalization": '''

@@ -70,6 +70,12 @@ def _node(node: Node, graph: Graph, shapes: list[Any]) -> Any:
     elif node.op == "Slice":
         for one in (attributes.pop("start"), attributes.pop("end"), -1):
             further([one])
+    elif node.op == "Conv":
+        stride, pad = attributes["stride"], attributes["pad"]
+        attributes = {"strides": [stride] * 2, "pads": [pad] * 4}
+    elif node.op == "MaxPool":
+        pads = [*attributes["before"], 1, 1]
+        attributes = {"kernel_shape": [3, 3], "strides": [2, 2], "pads": pads}
     elif node.op == "LayerNormalization":
         attributes["axis"] = -1
     elif node.op == "ArgMax":

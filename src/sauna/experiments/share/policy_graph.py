@@ -6,28 +6,22 @@ is exported is compared with that before it is given away.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from sauna.algorithm.policy.convolutions import LAYERS
 from sauna.algorithm.policy.normalize import EPSILON
 from sauna.algorithm.policy.observation import INVALID
 from sauna.algorithm.policy.recurrent import STATES
-from sauna.config.choices import BOUNDED
+from sauna.config.choices import BOUNDED, NETWORKS
 from sauna.config.settings import Config
+from sauna.envs.pictures import is_bytes, is_float_picture, is_picture
 from sauna.envs.shapes import leaves, mask_in
-from sauna.envs.spaces import Spaces, describe, stretch
+from sauna.envs.spaces import Spaces, board_of, describe, stretch
 from sauna.experiments.share.graph import Graph
+from sauna.experiments.share.layers_graph import Arrays, between, cast, dense, mlp, number
+from sauna.experiments.share.picture_graph import Picture, convolved, pixels, read_picture
 from sauna.system.errors import BadInput
-
-Arrays = Mapping[str, np.ndarray]
-NETWORKS = ("mlp", "nature-cnn")
-ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu", "sigmoid": "Sigmoid"}  # of one operation
-COMPOSED = ("elu", "gelu", "leaky_relu", "selu", "silu", "swish")
-SELU = 1.0507009873554805, 1.6732632423543772  # scale and alpha (Klambauer et al. 2017)
-NORM_EPSILON = 1e-6  # of flax's LayerNorm
 
 
 def policy_graph(
@@ -40,30 +34,23 @@ def policy_graph(
       observation_space, action_space: of the environment.
 
     Raises:
-      BadInput: the policy is of a kind that cannot be exported.
+      BadInput: the network is code of the user's.
     """
+    if config.network not in NETWORKS:
+        raise BadInput(
+            f"network: {config.network} is code of your own, which export does not write as ONNX "
+            "or numpy; its weights are in policy.safetensors"
+        )
     mask, observation_space = mask_in(observation_space)
     graph, spaces = Graph(), describe(observation_space, action_space)
-    _check(config, spaces)
-    if spaces.observation_kind == "image":
-        seen = _image(graph, config, spaces, observation_space)
-    elif config.normalize_observations:
-        seen = _vector(graph, observation_space, "float64")
-        seen = _normalized(graph, arrays, seen, config.clip_observations)
-    else:
-        seen = _vector(graph, observation_space, "float32")
-    trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
-    if config.network == "mlp":
-        features = _mlp(graph, arrays, seen, trunk, config)
-    else:
-        features = _nature_cnn(graph, arrays, seen, trunk)
+    features = _trunk(graph, config, arrays, observation_space, spaces)
     state = ""
     if config.recurrent != "none":
         cell = "cell" if config.trunk == "shared" else "policy_cell"
         features, state = {"lstm": _lstm, "gru": _gru}[config.recurrent](
             graph, arrays, features, cell, config.recurrent_width
         )
-    parameters = _dense(graph, arrays, features, "policy_head")
+    parameters = dense(graph, arrays, features, "policy_head")
     if mask:
         parameters = _valid(graph, parameters, mask)
     if spaces.action_kind == "continuous" and config.distribution in BOUNDED:
@@ -75,40 +62,55 @@ def policy_graph(
     return graph
 
 
-def _check(config: Config, spaces: Spaces) -> None:
-    """Refuses what is not written here.
+def _trunk(graph: Graph, config: Config, arrays: Arrays, space: Any, spaces: Spaces) -> str:
+    """The policy's features `[B, F]` of what the environment gives; see `make_trunk`."""
+    name = "trunk" if config.trunk == "shared" else "policy_trunk"
+    is_mlp = config.network == "mlp"
+    numbers, pictures = _seen(graph, config, arrays, space)
+    if not pictures and not is_mlp:  # numbers that are a small picture
+        board = board_of(spaces)
+        numbers, pictures = "", [Picture(graph.add("Reshape", numbers, shape=board), board)]
 
-    Raises:
-      BadInput: naming it.
+    def features(picture: Picture, name: str) -> str:
+        if is_mlp:
+            return pixels(graph, picture)
+        return convolved(graph, arrays, picture, config.network, name)
+
+    if spaces.is_combined:
+        found = [features(picture, f"{name}/picture_{i}") for i, picture in enumerate(pictures)]
+        x = graph.add("Concat", *filter(None, [numbers]), *found)
+        return mlp(graph, arrays, x, f"{name}/{name}", config)
+    x = features(pictures[0], name) if pictures else numbers
+    return mlp(graph, arrays, x, name, config) if is_mlp else x
+
+
+def _seen(graph: Graph, config: Config, arrays: Arrays, space: Any) -> tuple[str, list[Picture]]:
+    """The numbers of an observation `[B, D]`, normalised, and its pictures.
+
+    The numbers are in the order of `gym.flatten`. If there are none, their name is empty.
     """
-    unknown = ""
-    if config.network not in NETWORKS:
-        unknown = f"network {config.network}; only {' and '.join(NETWORKS)} are"
-    elif config.recurrent not in ("none", *STATES):
-        unknown = f"recurrent {config.recurrent}"
-    elif config.network == "mlp" and config.activation not in (*ACTIVATIONS, *COMPOSED):
-        unknown = f"activation {config.activation}"
-    elif spaces.observation_kind not in ("vector", "one_hot", "image"):
-        unknown = f"observations of kind {spaces.observation_kind}"
-    elif spaces.pictures:
-        unknown = "pictures beside other observations"
-    if unknown:
-        raise BadInput(f"export: not written as ONNX or numpy: {unknown}")
-
-
-def _vector(graph: Graph, space: Any, dtype: str) -> str:
-    """The observation as one vector `[B, obs]`, its parts in the order of `gym.flatten`."""
-    parts = [_part(graph, keys, part, dtype) for keys, part in leaves(space)]
-    return parts[0] if len(parts) == 1 else graph.add("Concat", *parts)
+    is_whole = is_bytes(space) or is_float_picture(space)
+    dtype = "float64" if config.normalize_observations else "float32"
+    parts: list[str] = []
+    pictures: list[Picture] = []
+    for keys, part in leaves(space):
+        if is_whole or is_picture(part):
+            pictures.append(read_picture(graph, keys, part))
+        else:
+            parts.append(_part(graph, keys, part, dtype))
+    if not parts:
+        return "", pictures
+    numbers = parts[0] if len(parts) == 1 else graph.add("Concat", *parts)
+    if config.normalize_observations:
+        numbers = _normalized(graph, arrays, numbers, config.clip_observations)
+    return numbers, pictures
 
 
 def _part(graph: Graph, keys: tuple[Any, ...], space: Any, dtype: str) -> str:
     """One part as floats `[B, n]`; numbers of choices become one-hot."""
     from gymnasium import spaces as gym
 
-    number = len(graph.inputs)
-    name = "observation" if not keys else f"observation_{number}"
-    shape = tuple(space.shape or ())
+    name, shape = graph.name_of(keys), tuple(space.shape or ())
     x = graph.input(name, keys, shape, space.dtype)
     size = int(np.prod(shape))
     if isinstance(space, gym.Discrete):
@@ -130,11 +132,7 @@ def _part(graph: Graph, keys: tuple[Any, ...], space: Any, dtype: str) -> str:
         return ones[0] if len(ones) == 1 else graph.add("Concat", *ones)
     if len(shape) != 1:
         x = graph.add("Reshape", x, shape=(size,))
-    return _cast(graph, x, str(space.dtype), dtype)
-
-
-def _cast(graph: Graph, x: str, before: str, after: str) -> str:
-    return x if before == after else graph.add("Cast", x, to=after)
+    return cast(graph, x, str(space.dtype), dtype)
 
 
 def _one_hot(graph: Graph, x: str, values: np.ndarray, name: str, dtype: str) -> str:
@@ -148,79 +146,8 @@ def _normalized(graph: Graph, arrays: Arrays, x: str, clip: float) -> str:
     variance = arrays["observation_moments/variance"]
     std = graph.constant("normaliser/std", (variance + EPSILON) ** 0.5)
     x = graph.add("Div", graph.add("Sub", x, mean), std)
-    x = _between(graph, x, np.float64(-clip), np.float64(clip), "normaliser")
+    x = between(graph, x, np.float64(-clip), np.float64(clip), "normaliser")
     return graph.add("Cast", x, to="float32")
-
-
-def _between(graph: Graph, x: str, low: Any, high: Any, name: str) -> str:
-    low, high = graph.constant(f"{name}/low", low), graph.constant(f"{name}/high", high)
-    return graph.add("Min", graph.add("Max", x, low), high)
-
-
-def _image(graph: Graph, config: Config, spaces: Spaces, space: Any) -> str:
-    """A picture as floats in [0, 1]: a vector for an MLP, `[B, C, H, W]` for convolutions."""
-    height, width, channels = spaces.observation_shape
-    first = len(space.shape) == 3 and tuple(space.shape) != spaces.observation_shape
-    x = graph.input("observation", (), tuple(space.shape), np.uint8)
-    high = graph.constant("picture/high", np.float32(spaces.observation_high))
-    x = graph.add("Div", graph.add("Cast", x, to="float32"), high)
-    if config.network == "mlp":
-        if first:
-            x = graph.add("Transpose", x, perm=[0, 2, 3, 1])
-        return graph.add("Reshape", x, shape=(height * width * channels,))
-    if len(space.shape) == 2:
-        return graph.add("Reshape", x, shape=(1, height, width))
-    return x if first else graph.add("Transpose", x, perm=[0, 3, 1, 2])
-
-
-def _dense(graph: Graph, arrays: Arrays, x: str, name: str) -> str:
-    kernel = graph.constant(f"{name}/kernel", arrays[f"params/{name}/kernel"])
-    bias = graph.constant(f"{name}/bias", arrays[f"params/{name}/bias"])
-    return graph.add("Gemm", x, kernel, bias)
-
-
-def _mlp(graph: Graph, arrays: Arrays, x: str, trunk: str, config: Config) -> str:
-    for i in range(len(config.hidden)):
-        x = _dense(graph, arrays, x, f"{trunk}/layer_{i}")
-        if config.layer_norm:
-            name = f"{trunk}/norm_{i}"
-            parts = [
-                graph.constant(f"{name}/{part}", arrays[f"params/{name}/{part}"])
-                for part in ("scale", "bias")
-            ]
-            x = graph.add("LayerNormalization", x, *parts, epsilon=NORM_EPSILON)
-        x = _activated(graph, x, config.activation)
-    return x
-
-
-def _activated(graph: Graph, x: str, activation: str) -> str:
-    """One of `choices.ACTIVATIONS`, as flax has it."""
-    if activation in ACTIVATIONS:
-        return graph.add(ACTIVATIONS[activation], x)
-    if activation in ("silu", "swish"):
-        return graph.add("Mul", x, graph.add("Sigmoid", x))
-    if activation == "leaky_relu":
-        return graph.add("Max", x, graph.add("Mul", x, _number(graph, 0.01)))
-    if activation == "gelu":  # in its form with a tanh
-        cube = graph.add("Mul", graph.add("Mul", x, x), x)
-        inner = graph.add("Add", x, graph.add("Mul", cube, _number(graph, 0.044715)))
-        inner = graph.add("Tanh", graph.add("Mul", inner, _number(graph, (2 / np.pi) ** 0.5)))
-        half = graph.add("Mul", x, _number(graph, 0.5))
-        return graph.add("Mul", half, graph.add("Add", inner, _number(graph, 1.0)))
-    scale, alpha = SELU if activation == "selu" else (1.0, 1.0)
-    zero = _number(graph, 0.0)
-    below = graph.add("Sub", graph.add("Exp", graph.add("Min", x, zero)), _number(graph, 1.0))
-    below = graph.add("Mul", below, _number(graph, alpha))
-    x = graph.add("Add", graph.add("Max", x, zero), below)
-    return graph.add("Mul", x, _number(graph, scale))
-
-
-def _number(graph: Graph, value: float) -> str:
-    """A float32 constant, named by its value."""
-    name = f"number/{value:g}"
-    if name not in graph.constants:
-        graph.constant(name, np.float32(value))
-    return name
 
 
 def _recurrent_products(
@@ -230,7 +157,7 @@ def _recurrent_products(
     state = graph.input("state", (), (size,), np.float32, "state")
     h = graph.add("Slice", state, start=first, end=size) if first else state
     kernel = graph.constant(f"{cell}/recurrent_kernel", arrays[f"params/{cell}/recurrent_kernel"])
-    return _dense(graph, arrays, x, f"{cell}/input"), graph.add("MatMul", h, kernel), state
+    return dense(graph, arrays, x, f"{cell}/input"), graph.add("MatMul", h, kernel), state
 
 
 def _gates(graph: Graph, x: str, width: int, number: int) -> list[str]:
@@ -259,7 +186,7 @@ def _gru(graph: Graph, arrays: Arrays, x: str, cell: str, width: int) -> tuple[s
     reset = graph.add("Sigmoid", graph.add("Add", r, of_r))
     old = graph.add("Mul", reset, graph.add("Add", of_n, bias))
     n = graph.add("Tanh", graph.add("Add", n, old))
-    rest = graph.add("Mul", graph.add("Sub", _number(graph, 1.0), z), n)
+    rest = graph.add("Mul", graph.add("Sub", number(graph, 1.0), z), n)
     h = graph.add("Add", rest, graph.add("Mul", z, state))
     return h, h
 
@@ -267,23 +194,9 @@ def _gru(graph: Graph, arrays: Arrays, x: str, cell: str, width: int) -> tuple[s
 def _valid(graph: Graph, logits: str, mask: int) -> str:
     """The logits with those of masked actions at `INVALID`."""
     given = graph.input("action_mask", (), (mask,), np.int8, "action_mask")
-    is_valid = graph.add("Greater", graph.add("Cast", given, to="float32"), _number(graph, 0.0))
+    is_valid = graph.add("Greater", graph.add("Cast", given, to="float32"), number(graph, 0.0))
     invalid = graph.constant("mask/invalid", np.float32(INVALID))
     return graph.add("Where", is_valid, logits, invalid)
-
-
-def _nature_cnn(graph: Graph, arrays: Arrays, x: str, trunk: str) -> str:
-    """`[B, C, H, W]` -> `[B, 512]`."""
-    for i, (_, _, stride) in enumerate(LAYERS):
-        name = f"{trunk}/conv_{i}"
-        kernel = arrays[f"params/{name}/kernel"].transpose(3, 2, 0, 1)
-        weights = graph.constant(f"{name}/kernel", kernel)
-        bias = graph.constant(f"{name}/bias", arrays[f"params/{name}/bias"])
-        x = graph.add("Relu", graph.add("Conv", x, weights, bias, strides=[stride, stride]))
-    x = graph.add("Transpose", x, perm=[0, 2, 3, 1])
-    size = arrays[f"params/{trunk}/dense/kernel"].shape[0]
-    x = graph.add("Reshape", x, shape=(size,))
-    return graph.add("Relu", _dense(graph, arrays, x, f"{trunk}/dense"))
 
 
 def _bounded(graph: Graph, distribution: str, width: int, x: str) -> str:
@@ -332,11 +245,11 @@ def _in_box(graph: Graph, space: Any, x: str, rescale: bool) -> str:
     low, high, dtype = space.low.ravel(), space.high.ravel(), str(space.dtype)
     stretched = stretch(space) if rescale else None
     if stretched is None:
-        x = _between(graph, x, low.astype(np.float32), high.astype(np.float32), "action")
-        return _cast(graph, x, "float32", dtype)
+        x = between(graph, x, low.astype(np.float32), high.astype(np.float32), "action")
+        return cast(graph, x, "float32", dtype)
     bounded, center, half = stretched
     edge = np.where(bounded, 1.0, np.inf).astype(np.float32)
-    x = graph.add("Cast", _between(graph, x, -edge, edge, "stretch"), to="float64")
+    x = graph.add("Cast", between(graph, x, -edge, edge, "stretch"), to="float64")
     x = graph.add("Mul", x, graph.constant("stretch/half", half))
     x = graph.add("Add", x, graph.constant("stretch/center", center))
-    return _between(graph, _cast(graph, x, "float64", dtype), low, high, "action")
+    return between(graph, cast(graph, x, "float64", dtype), low, high, "action")
