@@ -197,8 +197,12 @@ def _act(
 
 @compiled
 def _affine(x: Any, weight: Any, inputs: int, y: Any) -> None:
-    """`y = x @ weight[:inputs] + weight[inputs]`, four inputs at a time to write y less often."""
-    y[:] = weight[inputs]
+    """`y = x @ weight[:inputs] + weight[inputs]`, four inputs at a time to write y less often.
+
+    Loops and no slices: Numba takes seconds to compile the assignment of a slice.
+    """
+    for j in range(len(y)):
+        y[j] = weight[inputs, j]
     whole = inputs - inputs % 4
     for k in range(0, whole, 4):
         a, b, c, d = x[k], x[k + 1], x[k + 2], x[k + 3]
@@ -215,8 +219,13 @@ def _affine(x: Any, weight: Any, inputs: int, y: Any) -> None:
 def _normalize(y: Any, weight: Any) -> None:
     """Layer normalisation in place, with flax's epsilon, by the last two rows: scales, biases."""
     scales = len(weight) - 2
-    mean = y.mean()
-    scale = np.float32(1) / math.sqrt(((y - mean) ** 2).mean() + np.float32(1e-6))
+    total, squares = np.float32(0), np.float32(0)
+    for j in range(len(y)):
+        total += y[j]
+    mean = np.float32(total / len(y))
+    for j in range(len(y)):
+        squares += (y[j] - mean) * (y[j] - mean)
+    scale = np.float32(1) / math.sqrt(np.float32(squares / len(y)) + np.float32(1e-6))
     for j in range(len(y)):
         y[j] = (y[j] - mean) * scale * weight[scales, j] + weight[scales + 1, j]
 

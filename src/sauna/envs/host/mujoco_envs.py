@@ -124,7 +124,8 @@ def _record(action: Any, active: Any, actions: Any, steps: Any) -> int:
     longest = 0
     for i in range(len(steps)):
         if active[i]:
-            actions[i, steps[i]] = action[i]
+            for j in range(action.shape[1]):
+                actions[i, steps[i], j] = action[i, j]
             steps[i] += 1
             longest = max(longest, steps[i])
     return longest

@@ -177,7 +177,8 @@ def _advance(
     for i in range(len(addresses)):
         if active[i]:
             model, data = addresses[i]
-            control[:] = action[i]
+            for j in range(len(control)):
+                control[j] = action[i, j]
             _mj_set_state(model, data, control.ctypes.data, parts[0])
             for _ in range(frame_skip):
                 _mj_step(model, data)
