@@ -1,7 +1,11 @@
-"""Random rollouts and minibatches, and hyperparameters, for tests of the learner."""
+"""Random rollouts and minibatches, and hyperparameters, for tests of the learner.
+
+What tests call often is one program: else each of its operations is compiled by itself.
+"""
 
 from __future__ import annotations
 
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -10,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sauna.algorithm.learner.losses import Losses, Minibatch
+from sauna.algorithm.learner.samples import make_batch
 from sauna.algorithm.learner.update import Parts, minibatch_losses, plain_minibatch
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.distributions import Distribution
@@ -73,6 +78,10 @@ def parts_of(config: Config, policy: Policy, target: str = "sample", **rules: An
     return Parts(config, policy, TARGETS[target], Rules(**rules))
 
 
+batch_of = jax.jit(make_batch, static_argnames=("config", "target"))
+
+
+@partial(jax.jit, static_argnames="parts")
 def losses_on(params: Any, batch: Batch, h: Hypers, parts: Parts) -> Losses:
     """The objective on a batch as one minibatch."""
     return minibatch_losses(params, plain_minibatch(batch, parts), h, parts=parts)

@@ -167,7 +167,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
         "timing.jsonl",
     }
     assert (run / "figures" / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
-    again = sauna("train", ENV, "--out", str(run), cwd=tmp_path)
+    again = sauna_here("train", ENV, "--out", str(run), cwd=tmp_path)
     assert again.returncode == 2 and f"sauna resume {run}" in again.stderr
     assert "nothing to do" in sauna_here("resume", str(run), cwd=tmp_path).stdout
     for mode in ("sampled", "deterministic"):

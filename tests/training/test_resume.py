@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
 from sauna.training.display import make_display
 from small_envs import Scripted
+from threads import trained_here
 
 ENV = "small_envs:Scripted"
 
@@ -73,12 +75,11 @@ def test_what_moves_during_training_resumes_exactly(env: dict[str, Any]) -> None
     np.testing.assert_allclose([row["entropy_coef"] for row in whole.rows], 0.01 * left, rtol=1e-5)
 
 
-def test_resuming_a_complete_run_does_nothing(tmp_path: Path, capsys) -> None:
-    whole = finished(tmp_path)
-    before = {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.name != ".lock"}
-    sauna.resume(whole)
+def test_resuming_a_complete_run_does_nothing(run: Path, capsys) -> None:
+    before = {p: p.stat().st_mtime_ns for p in run.rglob("*") if p.name != ".lock"}
+    sauna.resume(run)
     assert "nothing to do" in capsys.readouterr().out
-    assert before == {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.name != ".lock"}
+    assert before == {p: p.stat().st_mtime_ns for p in run.rglob("*") if p.name != ".lock"}
 
 
 def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, capsys) -> None:
@@ -117,21 +118,22 @@ def make_incomplete(run: Path, iteration: int) -> None:
             path.rmdir()
 
 
-def finished(tmp_path: Path, **settings) -> Path:
-    run = tmp_path / "run"
-    sauna.train(
-        ENV,
-        out=run,
-        quiet=True,
-        checkpoint_every=2,
-        keep_checkpoints=9,
-        **{**SMALL, "arm": "sauna", **settings},
-    )
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run, of which each test changes a copy."""
+    run = tmp_path_factory.mktemp("finished") / "run"
+    kept = {"checkpoint_every": 2, "keep_checkpoints": 9}
+    with trained_here():
+        sauna.train(ENV, out=run, quiet=True, arm="sauna", **kept, **SMALL)
     return run
 
 
-def test_a_damaged_checkpoint_is_named_and_the_one_before_used(tmp_path, capsys) -> None:
-    run = finished(tmp_path)
+@pytest.fixture
+def run(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "run"))
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_used(run, capsys) -> None:
     expected, table = (run / "metrics.jsonl").read_bytes(), timeless_table(run)
     (run / "summary.json").unlink()
     newest = checkpoint.numbered(run / "checkpoints")[-1]
@@ -170,9 +172,8 @@ def test_a_damaged_newer_checkpoint_takes_no_place_of_a_good_one(tmp_path) -> No
     assert not (tmp_path / "00000050").exists()
 
 
-def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch) -> None:
+def test_a_run_keeps_the_values_that_it_began_with(run, monkeypatch) -> None:
     """A later version may have other presets; members' own values are the run's."""
-    run = finished(tmp_path)
     expected = (run / "metrics.jsonl").read_bytes()
     make_incomplete(run, 2)
     changed = {**presets.PRESETS, "mujoco": {"learning_rate": 1e-3, "gae_lambda": 0.5}}
@@ -187,8 +188,7 @@ def test_a_run_keeps_the_values_that_it_began_with(tmp_path, monkeypatch) -> Non
 
 
 @pytest.mark.parametrize("change", [{"devices": 2}, {"device": "cpu"}, {"distributed": "h:1,2,0"}])
-def test_what_only_the_device_reads_is_refused_on_the_host(change: dict, tmp_path) -> None:
-    run = finished(tmp_path)
+def test_what_only_the_device_reads_is_refused_on_the_host(change: dict, run) -> None:
     make_incomplete(run, 2)
     with pytest.raises(BadInput, match="only read with backend device"):
         sauna.resume(run, quiet=True, **change)
@@ -229,8 +229,7 @@ def test_a_run_with_a_lambda_is_resumed_by_passing_it_again(tmp_path, capsys) ->
     assert sauna.load(run)(np.zeros(3)).shape == (2,)
 
 
-def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None:
-    run = finished(tmp_path)
+def test_a_checkpoint_of_another_run_or_environment_is_refused(run) -> None:
     make_incomplete(run, 2)
     path = run / "config.json"
     stored = json.loads(path.read_text())
@@ -247,9 +246,8 @@ def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None
         sauna.resume(run, quiet=True, trust=True)
 
 
-def test_where_rows_were_lost_an_older_checkpoint_is_used(tmp_path, capsys) -> None:
+def test_where_rows_were_lost_an_older_checkpoint_is_used(run, capsys) -> None:
     """And the newer one, which counts on rows that are now written anew, is written anew, too."""
-    run = finished(tmp_path)
     expected = (run / "metrics.jsonl").read_bytes()
     (run / "summary.json").unlink()
     first = checkpoint.load_newest(run / "checkpoints", print)
@@ -263,8 +261,7 @@ def test_where_rows_were_lost_an_older_checkpoint_is_used(tmp_path, capsys) -> N
     assert again.manifest["logs"]["timing.jsonl"] == (run / "timing.jsonl").stat().st_size
 
 
-def test_where_too_many_rows_were_lost_it_is_said(tmp_path) -> None:
-    run = finished(tmp_path)
+def test_where_too_many_rows_were_lost_it_is_said(run) -> None:
     make_incomplete(run, 2)
     os.truncate(run / "metrics.jsonl", 10)
     with pytest.raises(checkpoint.BadCheckpoint, match="rows are lost"):

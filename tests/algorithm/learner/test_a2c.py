@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from arrays import (
+    batch_of,
     hypers,
     losses_of_terms,
     losses_on,
@@ -21,7 +22,6 @@ from arrays import (
 )
 from helpers import Recorder, configured, equal, make_job, own, resumed, train_here
 from sauna.algorithm.learner import a2c
-from sauna.algorithm.learner.samples import make_batch
 from sauna.algorithm.learner.update import init_state, update_on_all
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy, score
@@ -158,7 +158,7 @@ def test_n_step_returns_are_lambda_1() -> None:
 
     def returns(gae_lambda: float) -> np.ndarray:
         h = jax.tree.map(np.float32, hypers(gae_lambda=gae_lambda))
-        batch = make_batch(single, h, no_key(), config=config, target=TARGETS["sample"])
+        batch = batch_of(single, h, no_key(), config=config, target=TARGETS["sample"])
         return np.asarray(batch.return_).reshape(5, 16)
 
     np.testing.assert_allclose(returns(1.0), expected, atol=1e-5)

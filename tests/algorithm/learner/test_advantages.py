@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from arrays import no_key, random_rollout
+from arrays import batch_of, no_key, random_rollout
 from helpers import configured
 from sauna.algorithm.learner.advantages import gae
-from sauna.algorithm.learner.samples import advantages_over_all, make_batch
+from sauna.algorithm.learner.samples import advantages_over_all
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.types import Hypers, Rollout
 
@@ -130,8 +130,8 @@ def test_advantages_over_all_do_not_depend_on_what_is_kept() -> None:
     r = random_rollout(3, keep_rate=0.6)
     r32 = jax.tree.map(lambda x: jnp.asarray(x, np.float32) if x.dtype == float else x, r)
     h = jax.tree.map(np.float32, hypers())
-    batch = make_batch(r32, h, no_key(), config=config, target=TARGETS["rollout"])
-    every = np.asarray(advantages_over_all(r32, h, True))
+    batch = batch_of(r32, h, no_key(), config=config, target=TARGETS["rollout"])
+    every = np.asarray(over_all(r32, h, True))
     for n in range(3):
         number = r.keep[:, n].sum()
         got = np.asarray(batch.advantage).reshape(40, 3)[:number, n]
@@ -151,6 +151,6 @@ def test_padding_behind_the_stream_changes_nothing() -> None:
         valid=jnp.concatenate([r.valid, no]), keep=jnp.concatenate([r.keep, no])
     )
     h = jax.tree.map(np.float32, hypers())
-    one = make_batch(r, h, no_key(), config=config, target=TARGETS["episode"])
-    other = make_batch(longer, h, no_key(), config=config, target=TARGETS["episode"])
+    one = batch_of(r, h, no_key(), config=config, target=TARGETS["episode"])
+    other = batch_of(longer, h, no_key(), config=config, target=TARGETS["episode"])
     jax.tree.map(np.testing.assert_array_equal, one, other)

@@ -10,11 +10,10 @@ import jax
 import numpy as np
 import pytest
 
-from arrays import hypers, no_key, parts_of, random_rollout
+from arrays import batch_of, hypers, no_key, parts_of, random_rollout
 from helpers import configured, equal, make_job, train_here
 from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.replay import as_if_now, empty_replay, pool_rows, remember
-from sauna.algorithm.learner.samples import make_batch
 from sauna.algorithm.learner.update import init_state, minibatch_order
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy
@@ -37,7 +36,8 @@ CONFIG = configured(
 POLICY = make_policy(CONFIG, SPACES)
 PARAMS = POLICY.init(jax.random.key(1))
 H = jax.tree.map(np.float32, hypers())
-HOW: Any = {"config": CONFIG, "policy": POLICY, "target": TARGETS["sample"]}
+apply = jax.jit(POLICY.apply)
+now = jax.jit(partial(as_if_now, config=CONFIG, policy=POLICY, target=TARGETS["sample"]))
 
 
 def rollout_of(params: Any, seed: int) -> Rollout:
@@ -45,7 +45,7 @@ def rollout_of(params: Any, seed: int) -> Rollout:
     rollout = jax.tree.map(
         lambda x: x.astype(np.float32) if x.dtype == float else x, random_rollout(seed, STEPS, ENVS)
     )
-    output = POLICY.apply(params, rollout.observation)
+    output = apply(params, rollout.observation)
     value = np.asarray(output.value)
     ended = rollout.terminated | rollout.truncated
     last = np.arange(STEPS)[:, None] == STEPS - 1
@@ -60,8 +60,8 @@ def rollout_of(params: Any, seed: int) -> Rollout:
 
 def test_the_policy_that_acted_gets_what_gae_gives() -> None:
     rollout = rollout_of(PARAMS, 0)
-    again = as_if_now(rollout, PARAMS, H, **HOW)
-    batch = make_batch(rollout, H, no_key(), config=CONFIG, target=TARGETS["sample"])
+    again = now(rollout, PARAMS, H)
+    batch = batch_of(rollout, H, no_key(), config=CONFIG, target=TARGETS["sample"])
     assert np.all(again.importance == 1)
     for name in ("advantage", "return_", "value", "log_prob", "vex_target"):
         np.testing.assert_allclose(getattr(again, name), getattr(batch, name), atol=1e-5)
@@ -69,7 +69,7 @@ def test_the_policy_that_acted_gets_what_gae_gives() -> None:
 
 def by_hand(rollout: Rollout, params: Any, lambda_: float = 0.8) -> dict[str, np.ndarray]:
     """V-trace in float64, env by env and backwards in time."""
-    output = POLICY.apply(params, rollout.observation)
+    output = apply(params, rollout.observation)
     v = np.asarray(output.value, np.float64)
     log_prob = np.asarray(POLICY.distribution.log_prob(output.policy, rollout.action), np.float64)
     rho = np.minimum(1.0, np.exp(log_prob - rollout.log_prob))
@@ -95,12 +95,12 @@ def by_hand(rollout: Rollout, params: Any, lambda_: float = 0.8) -> dict[str, np
 
 
 def test_another_policy_is_corrected_as_by_hand() -> None:
-    rollout, now = rollout_of(PARAMS, 0), POLICY.init(jax.random.key(2)) * 1.5
-    again, expected = as_if_now(rollout, now, H, **HOW), by_hand(rollout, now)
+    rollout, params = rollout_of(PARAMS, 0), POLICY.init(jax.random.key(2)) * 1.5
+    again, expected = now(rollout, params, H), by_hand(rollout, params)
     assert 0.05 < np.mean(expected["importance"] < 1) < 0.95
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(again, name), values, rtol=1e-4, atol=1e-5)
-    wrong = by_hand(rollout, now, lambda_=0.9)["advantage"]
+    wrong = by_hand(rollout, params, lambda_=0.9)["advantage"]
     assert np.max(np.abs(wrong - again.advantage)) > 0.01
 
 
@@ -125,7 +125,7 @@ def test_samples_of_rollouts_that_are_there_are_learned_from() -> None:
     run = jax.jit(partial(learn, parts=parts))
     for i, rollouts in enumerate((1, 2, 3, 3)):
         rollout = rollout_of(state.params, i)
-        batch = make_batch(rollout, H, no_key(), config=CONFIG, target=TARGETS["sample"])
+        batch = batch_of(rollout, H, no_key(), config=CONFIG, target=TARGETS["sample"])
         state, metrics = run(
             state, rollout, batch, H, minibatch_order(CONFIG, 0, i), jax.random.key(i)
         )

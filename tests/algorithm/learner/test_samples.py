@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from arrays import (
+    batch_of,
     hypers,
     losses_of_terms,
     losses_on,
@@ -20,7 +23,7 @@ from arrays import (
 from helpers import configured
 from sauna.algorithm.learner import ppo
 from sauna.algorithm.learner.metrics import head_statistics
-from sauna.algorithm.learner.samples import advantages_over_all, make_batch
+from sauna.algorithm.learner.samples import advantages_over_all
 from sauna.algorithm.learner.update import minibatch_order
 from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.policy import make_policy
@@ -33,6 +36,7 @@ from sauna.envs.spaces import Spaces
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
 CONFIG = configured(rollout_steps=40, envs=3, minibatches=4)
+over_all = jax.jit(advantages_over_all, static_argnums=2)
 
 
 def single(rollout: Rollout) -> Rollout:
@@ -48,8 +52,8 @@ def scalars(**values: float) -> Hypers:
 @pytest.mark.parametrize("name", ["rollout", "sample"])
 def test_returns_and_targets_are_those_of_the_kept_steps(name: str) -> None:
     rollout = random_rollout(7, keep_rate=0.6)
-    batch = make_batch(single(rollout), scalars(), no_key(), config=CONFIG, target=TARGETS[name])
-    advantage = np.asarray(advantages_over_all(single(rollout), scalars(), True))
+    batch = batch_of(single(rollout), scalars(), no_key(), config=CONFIG, target=TARGETS[name])
+    advantage = np.asarray(over_all(single(rollout), scalars(), True))
     columns = [
         np.asarray(x).reshape(40, 3)
         for x in (batch.return_, batch.log_prob, batch.value, batch.vex_target)
@@ -72,7 +76,7 @@ def test_a_target_per_minibatch_is_computed_on_the_minibatch() -> None:
     policy = make_policy(CONFIG, VECTOR)
     params = policy.init(jax.random.key(0))
     batch = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), random_batch())
-    output = policy.apply(params, batch.observation)
+    output = jax.jit(policy.apply)(params, batch.observation)
     for name in ("minibatch", "sample"):
         losses = losses_on(params, batch, scalars(), parts_of(CONFIG, policy, name))
         on = np.asarray(batch.weight) > 0
@@ -134,7 +138,7 @@ def test_a_ratio_that_reaches_the_threshold_exactly_is_kept() -> None:
         ordered=history.ordered.at[0, 0].set(-4e4), number=history.number + 1
     )
     for vex, kept in ((3e4, True), (-3e4, True), (2.9e4, False)):
-        got = informative(jnp.array([vex], jnp.float32), history, jnp.float32(0.75))
+        got = jax.jit(informative)(jnp.array([vex], jnp.float32), history, jnp.float32(0.75))
         assert bool(got[0]) is kept
 
 
@@ -143,20 +147,20 @@ def test_a_ratio_that_reaches_the_threshold_exactly_is_kept() -> None:
 )
 def test_stretches_decide_as_one_long_segment_does(filter) -> None:
     """Padding behind a segment is not looked at, and a step's key is that of its place."""
-    vex = jnp.asarray(np.random.default_rng(0).normal(size=(12, 2)), jnp.float32)
-    observation, key = jnp.zeros((12, 2, 3)), jax.random.key(1)
+    vex = np.random.default_rng(0).normal(size=(12, 2)).astype(np.float32)
+    observation, key = np.zeros((12, 2, 3), np.float32), jax.random.key(1)
     given = scalars(threshold=0.8, drop_rate=0.5)
+    decided = jax.jit(partial(decide, filter))
 
     def run(lengths: list[int]) -> np.ndarray:
         state, first, masks = filter.init(2, 12), 0, []
         for length in lengths:
-            rows = jnp.full((12, 2), 99.0).at[:length].set(vex[first : first + length])
+            rows = np.full((12, 2), 99.0, np.float32)
+            rows[:length] = vex[first : first + length]
             steps = unscored(observation, rows)
-            state, mask = decide(
-                filter, state, steps, jnp.int32(first), jnp.int32(length), key, given
-            )
+            state, mask = decided(state, steps, np.int32(first), np.int32(length), key, given)
             assert not mask[length:].any()
-            masks.append(np.asarray(mask[:length]))
+            masks.append(np.asarray(mask)[:length])
             first += length
         return np.concatenate(masks)
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from algorithm.selection import oracle, oracle_loss
-from arrays import hypers, losses_on, no_key, parts_of, random_batch, random_rollout
+from arrays import batch_of, hypers, losses_on, no_key, parts_of, random_batch, random_rollout
 from helpers import configured
 from sauna.algorithm.learner import ppo
 from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.losses import Losses, Minibatch
 from sauna.algorithm.learner.metrics import UpdateMetrics
-from sauna.algorithm.learner.samples import make_batch, recomputed
+from sauna.algorithm.learner.samples import recomputed
 from sauna.algorithm.learner.selected import minibatch
 from sauna.algorithm.learner.update import (
     Parts,
@@ -83,10 +83,10 @@ def given() -> Given:
     policy = make_policy(CONFIG, SPACES)
     parts = parts_of(CONFIG, policy)
     state, rollout = init_state(parts, jax.random.key(1)), floats(random_rollout(3, STEPS, ENVS))
-    output = policy.apply(state.params, rollout.observation)
+    output = jax.jit(policy.apply)(state.params, rollout.observation)
     rollout = rollout._replace(log_prob=policy.distribution.log_prob(output.policy, rollout.action))
     h = floats(hypers(entropy_coef=0.0))
-    batch = make_batch(rollout, h, no_key(), config=CONFIG, target=TARGETS["sample"])
+    batch = batch_of(rollout, h, no_key(), config=CONFIG, target=TARGETS["sample"])
     rng = np.random.default_rng(0)
     order = rng.permuted(np.tile(np.arange(ROWS, dtype=np.int32), (EPOCHS, 1)), axis=1)
     return Given(parts, state, rollout, batch, h, jnp.asarray(order))
@@ -247,9 +247,8 @@ def test_rows_drawn_for_the_policy_alone_leave_the_critics_unweighted(given: Giv
     for losses, scaled in (("all", True), ("policy", False)):
         config = dataclasses.replace(CONFIG, selection_losses=losses)
         parts = given.parts._replace(config=config)
-        got = minibatch(
-            given.batch, choice, drawn, jnp.arange(SIZE), jnp.ones(SIZE, bool), parts=parts
-        )
+        of = jax.jit(partial(minibatch, parts=parts))
+        got = of(given.batch, choice, drawn, jnp.arange(SIZE), jnp.ones(SIZE, bool))
         assert (got.value_scale is not None) is scaled
         np.testing.assert_allclose(got.policy_scale, 1 / (ROWS * p[:SIZE]))
         np.testing.assert_array_equal(got.value_rows.return_, given.batch.return_[3 : SIZE + 3])
@@ -305,7 +304,7 @@ def test_avecs_values_are_right_on_average() -> None:
 
     def mean_error(critic: str) -> float:
         config = dataclasses.replace(CONFIG, critic=critic, clip_value=False)
-        batch = make_batch(rollout, h, no_key(), config=config, target=TARGETS["sample"])
+        batch = batch_of(rollout, h, no_key(), config=config, target=TARGETS["sample"])
         error = np.asarray(batch.return_ - batch.value) * np.asarray(batch.weight)
         return float(error.sum() / np.sum(batch.weight))
 
@@ -326,7 +325,7 @@ def test_recomputed_advantages_are_numpys_with_todays_values(truncation: str) ->
     advantage, return_ = oracle_loss.gae(rollout.reward, now, following, cut, ended, 0.9, 0.8)
     config: Config = dataclasses.replace(CONFIG, truncation=truncation, recompute_advantages=True)
     single, h = floats(rollout._replace(keep=np.ones((STEPS, ENVS), bool))), floats(hypers())
-    batch = make_batch(single, h, no_key(), config=config, target=TARGETS["sample"])
+    batch = batch_of(single, h, no_key(), config=config, target=TARGETS["sample"])
     got = recomputed(batch, single, jnp.asarray(now, jnp.float32), h, config=config)
     np.testing.assert_allclose(got.advantage, advantage.ravel(), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(got.return_, return_.ravel(), rtol=1e-4, atol=1e-5)
@@ -394,7 +393,8 @@ def test_a_loss_weight_sees_the_ratio_whatever_the_objective_is(algorithm: str) 
     policy = make_policy(CONFIG, Spaces("vector", (3,), "continuous", (2,), "", ""))
     config = dataclasses.replace(CONFIG, algorithm=algorithm)
     batch, params = floats(random_batch()), policy.init(jax.random.key(0))
-    losses_on(
+    uncompiled = losses_on.__wrapped__  # its terms are looked at
+    uncompiled(
         params, batch, floats(hypers()), parts_of(config, policy, loss_weight=LossWeight(look))
     )
     now = policy.distribution.log_prob(policy.apply(params, batch.observation).policy, batch.action)
@@ -420,12 +420,12 @@ def test_recomputed_advantages_are_of_the_steps_that_a_control_keeps() -> None:
         arm="sauna+random", recompute_advantages=True, rollout_steps=STEPS, envs=ENVS, minibatches=1
     )
     rollout, h = floats(random_rollout(6, STEPS, ENVS, 0.5)), floats(hypers())
-    batch = make_batch(rollout, h, jax.random.key(0), config=config, target=TARGETS["sample"])
+    batch = batch_of(rollout, h, jax.random.key(0), config=config, target=TARGETS["sample"])
     kept = jnp.zeros(STEPS * ENVS, bool).at[batch.row].set(batch.weight > 0)
     assert bool(jnp.any(kept != rollout.keep.ravel()))
     ended = rollout.terminated | rollout.truncated
     following = jnp.concatenate([rollout.value[1:], rollout.next_value[-1:]])
     rollout = rollout._replace(next_value=jnp.where(ended, rollout.next_value, following))
-    batch = make_batch(rollout, h, jax.random.key(0), config=config, target=TARGETS["sample"])
+    batch = batch_of(rollout, h, jax.random.key(0), config=config, target=TARGETS["sample"])
     again = recomputed(batch, rollout, rollout.value, h, config=config)
     np.testing.assert_allclose(again.advantage, batch.advantage, rtol=1e-4, atol=1e-5)

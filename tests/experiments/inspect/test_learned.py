@@ -60,7 +60,7 @@ def asked(arm: str, envs: int = ENVS, **settings: Any) -> Asked:
     learner = make_learner(config, policy, SPACES)
     state, h = learner.init(jax.random.key(1)), floats(hypers(learning_rate=0.05))
     streams = floats(random_rollout(3, ROLLOUTS * STEPS, envs))
-    output = policy.apply(state.params, streams.observation)
+    output = jax.jit(policy.apply)(state.params, streams.observation)
     log_prob = policy.distribution.log_prob(output.policy, streams.action)
     streams = streams._replace(log_prob=np.asarray(log_prob))
     scored = ScoredStep(*(getattr(streams, name) for name in ScoredStep._fields))
@@ -90,7 +90,7 @@ def of_env_0(columns: list[np.ndarray]) -> np.ndarray:
 def heads(made: Asked, rollout: Rollout) -> Any:
     """The network at a rollout's steps, flat, and the policy's entropy there."""
     flat: Any = np.asarray(rollout.observation).reshape(-1, 2)
-    output = made.policy.apply(made.state.params, flat)
+    output = jax.jit(made.policy.apply)(made.state.params, flat)
     return output, np.asarray(made.policy.distribution.entropy(output.policy))
 
 
@@ -224,7 +224,7 @@ def test_sample_dropout_leaves_out_what_has_gone_far_by_the_end_of_the_update() 
         batch = made.learner.make_batch(rollout, made.hypers, key)
         own = jax.tree.map(jnp.copy, made.state)
         updated, _ = made.learner.learn(own, rollout, batch, made.hypers, order, key)
-        output = made.policy.apply(updated.params, batch.observation)
+        output = jax.jit(made.policy.apply)(updated.params, batch.observation)
         log_prob = np.asarray(made.policy.distribution.log_prob(output.policy, batch.action))
         keep.append(oracle.sample_dropout_keep(log_prob, np.asarray(batch.log_prob), 0.1))
     np.testing.assert_array_equal(made.found.last_weight, of_env_0(keep))
@@ -282,7 +282,7 @@ def test_a_filter_of_ones_own_sees_actions_values_and_log_probabilities(
     run: Path, found: Inspection
 ) -> None:
     policy = TrainedPolicy(load_artifact(run), 0)
-    output = policy.policy.apply(policy.params, found.played.observation)
+    output = jax.jit(policy.policy.apply)(policy.params, found.played.observation)
     mean, log_std = np.split(np.asarray(output.policy, float), 2, -1)
     z = (found.played.action - mean) / np.exp(log_std)
     log_prob = -(0.5 * z**2 + log_std + 0.5 * np.log(2 * np.pi)).sum(-1)

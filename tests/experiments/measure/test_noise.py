@@ -34,6 +34,7 @@ from sauna.system.errors import BadInput
 
 PAIRS = (("dropped", "control"),)
 GROUPS = ("dropped", "control")
+gradient_of = jax.jit(policy_gradient, static_argnames=("policy", "standardized"))
 
 
 def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
@@ -42,7 +43,7 @@ def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
     with jax.enable_x64(True):
         params = jnp.asarray(policy.init(jax.random.key(0)), jnp.float64)
         batch = random_batch()
-        output = policy.apply(params, batch.observation)
+        output = jax.jit(policy.apply)(params, batch.observation)
         log_prob = policy.distribution.log_prob(output.policy, batch.action)
         batch = batch._replace(log_prob=log_prob)
         h = hypers(entropy_coef=0.0, value_coef=0.0, vex_coef=0.0)
@@ -50,7 +51,7 @@ def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
         def loss(params: Any) -> Any:
             return losses_on(params, batch, h, parts_of(config, policy)).total
 
-        got = policy_gradient(
+        got = gradient_of(
             params,
             batch.observation,
             batch.action,
@@ -59,7 +60,7 @@ def test_the_gradient_is_that_of_the_training_loss_at_ratio_one() -> None:
             policy=policy,
             standardized=True,
         )
-        np.testing.assert_allclose(got, -jax.grad(loss)(params), atol=1e-12)
+        np.testing.assert_allclose(got, -jax.jit(jax.grad(loss))(params), atol=1e-12)
         assert np.abs(got).max() > 1e-3
 
 
@@ -68,9 +69,9 @@ def test_the_gradient_by_hand_where_it_is_simple() -> None:
     policy = make_policy(configured(hidden="8,8"), VECTOR)
     params, batch = policy.init(jax.random.key(1)), random_batch(6)
     observation, action = (x.astype(np.float32) for x in (batch.observation, batch.action))
-    mean, log_std = np.split(np.asarray(policy.apply(params, observation).policy), 2, -1)
+    mean, log_std = np.split(np.asarray(jax.jit(policy.apply)(params, observation).policy), 2, -1)
     z, a, w = (action - mean) / np.exp(log_std), batch.advantage[:, None], batch.weight[:, None]
-    gradient = policy_gradient(
+    gradient = gradient_of(
         params,
         observation,
         action,
