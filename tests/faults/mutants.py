@@ -43,7 +43,7 @@ QUICK = (
 )
 SLOW = ("probes", "algorithm/test_population")  # for what the others let pass
 CHEAP_COMPILING = {  # as `make test` does
-    "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
+    "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
     "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
 }
 
