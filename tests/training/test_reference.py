@@ -176,8 +176,8 @@ class Setup:
         return collected, self.learner.make_batch(collected.rollout, self.hypers, no_key())
 
     def act(self, seen, noise):
-        action = np.asarray(self.program.act(self.params[None], seen[None], noise[None]))[0]
-        scores = np.asarray(self.program.score(self.params, seen[None], action[None]))[0]
+        found = self.program.act(self.params[None], seen[None], noise[None])
+        action, scores = (np.asarray(x)[0] for x in found)
         return action, *scores.T
 
     def value(self, seen):

@@ -208,6 +208,8 @@ def test_convolutions_are_xlas(pictures: int) -> None:
     for one, other in zip(ours, expected, strict=True):
         scale = np.abs(other).max()
         np.testing.assert_allclose(one / scale, other / scale, rtol=1e-4, atol=1e-5)
+    without_gradient = np.asarray(jax.jit(convolutions)(layers, x))
+    np.testing.assert_allclose(without_gradient, ours[-1], rtol=1e-4, atol=1e-4)
 
 
 def test_the_gradient_of_bytes_is_that_of_their_shares() -> None:
