@@ -39,6 +39,7 @@ OTHERS = {
     "drop_rate": 0.25,
     "stop_at": 2.0,
     "init_from": "runs/another",
+    "wrap": ["wrappers:plus_one"],
 }
 
 
