@@ -25,7 +25,7 @@ from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.training.loop.budget import hypers_now, step_limit
 from sauna.training.loop.member_state import Counters
-from worlds import Scripted
+from small_envs import Scripted
 
 T, N = 24, 2
 
@@ -149,7 +149,7 @@ class Setup:
 
     def __init__(self, arm: str, **settings) -> None:
         job = make_job(
-            "worlds:Scripted",
+            "small_envs:Scripted",
             arm=arm,
             seeds="3,",
             envs=N,

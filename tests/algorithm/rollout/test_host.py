@@ -22,7 +22,7 @@ from sauna.algorithm.types import member_keys
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.training.loop.budget import hypers_now
 from sauna.training.loop.member_state import Counters
-from worlds import Board
+from small_envs import Board
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ from worlds import Board
     ],
 )
 def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted(arm: str, settings) -> None:
-    job = make_job("worlds:Scripted", arm=arm, envs=3, steps=1000, seeds=2, **settings)
+    job = make_job("small_envs:Scripted", arm=arm, envs=3, steps=1000, seeds=2, **settings)
     rows = train_here(job).rows
     for seed in (0, 1):
         own = [row for row in rows if row["seed"] == seed]
@@ -50,23 +50,25 @@ def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted(arm: str, set
 
 
 def test_a_budget_of_kept_steps_acts_more_often() -> None:
-    job = make_job("worlds:Scripted", arm="sauna-reference", threshold=0.6, steps=320, seeds=1)
+    job = make_job("small_envs:Scripted", arm="sauna-reference", threshold=0.6, steps=320, seeds=1)
     last = train_here(job).rows[-1]
     assert last["kept_steps"] == 320 < last["env_steps"]
 
 
 def test_the_learning_rate_falls_linearly_with_env_steps_or_not_at_all() -> None:
-    rows = train_here(make_job("worlds:Scripted", arm="ppo", learning_rate=0.5)).rows
+    rows = train_here(make_job("small_envs:Scripted", arm="ppo", learning_rate=0.5)).rows
     np.testing.assert_allclose([r["learning_rate"] for r in rows], [0.5, 0.375, 0.25, 0.125])
     settings = {"learning_rate": 0.5, "preset": "mujoco-release"}
-    rows = train_here(make_job("worlds:Scripted", arm="ppo", **settings)).rows
+    rows = train_here(make_job("small_envs:Scripted", arm="ppo", **settings)).rows
     assert {r["learning_rate"] for r in rows} == {0.5}
 
 
 @pytest.mark.parametrize("arm", ["ppo", "sauna"])
 def test_scores_given_while_acting_are_those_of_the_whole_rollout(arm: str) -> None:
     """A CNN gives log-probability, value and Vex with its actions; of each member its own."""
-    job = make_job("worlds:Board", network="small-cnn", arm=arm, seeds=2, envs=3, rollout_steps=8)
+    job = make_job(
+        "small_envs:Board", network="small-cnn", arm=arm, seeds=2, envs=3, rollout_steps=8
+    )
     program, keys = make_program(job.config, job.spaces), [member_keys(seed) for seed in (0, 1)]
     envs = GymnasiumEnvs(Board, [(seed, n) for seed in (0, 1) for n in range(3)])
     collector = HostCollector(program, job.spaces, envs, keys)
