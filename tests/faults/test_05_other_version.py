@@ -39,6 +39,7 @@ OTHERS = {
     "drop_rate": 0.25,
     "stop_at": 2.0,
     "init_from": "runs/another",
+    "wrap": ["wrappers:plus_one"],
 }
 
 
@@ -75,8 +76,10 @@ def _change_setting(whole: Path, run: Path, name: str, tally: Tally) -> None:
     before = stored["config"][name]
     stored["config"][name] = _other(name, before)
     path.write_text(json.dumps(stored))
-    # The environment cannot be made with them; the sequences do not fill the minibatches.
-    refuser = {"env_kwargs": "env", "recurrent": "minibatches"}.get(name, name)
+    # The environment cannot be made with them; the sequences do not fill the minibatches; stacked
+    # observations are other ones.
+    refusers = {"env_kwargs": "env", "recurrent": "minibatches", "stack": "observation"}
+    refuser = refusers.get(name, name)
     _expect_refusal(run, refuser, f"setting {name}", tally)
 
 
