@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import importlib.util
 import json
-import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from helpers import TESTS
+from clusters import Place, needs_ray, on_ray, same, until
+from helpers import environment
 from sauna import cli
 from sauna.experiments.study.execute import ray_files
 from sauna.experiments.study.execute.ray_node import Hub
 from sauna.experiments.study.tables import settings
 
-MARK = "SAUNA_TEST_CLUSTER"  # in the environment of every process that a test starts
 STUDY = """
 tasks = ["worlds:Scripted"]
 seeds = 4
@@ -47,10 +41,6 @@ threshold = 0.9
 """
 
 slow = pytest.mark.slow
-needs_ray = pytest.mark.skipif(
-    importlib.util.find_spec("ray") is None,
-    reason="Ray is not installed: pip install 'sauna-rl[cluster]'",
-)
 
 
 @pytest.fixture
@@ -120,6 +110,10 @@ def test_a_task_that_was_replaced_is_not_listened_to() -> None:
         assert [said.begins for said in await hub.take(1.0)] == [False, True]
         assert await hub.say("unit", 1, [{"phase": "goes on"}], None)
         assert await hub.take(0.01) == []
+        await hub.stop_one("other")
+        assert not await hub.say("unit", 2, [], None)
+        await hub.stop_one("unit")
+        assert await hub.say("unit", 2, [], None)
         await hub.stop()
         await hub.answer("unit", None)
         assert await second == (2, None)
@@ -236,108 +230,21 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run(
         [sys.executable, "-m", "sauna", "study", "../mine.toml", "--processes=2"],
         cwd=path / "local",
-        env={**os.environ, "PYTHONPATH": TESTS},
+        env=environment(),
         check=True,
         stdout=subprocess.PIPE,
     )
     return path / "local/runs"
 
 
-class Place:
-    """A folder for one study on Ray; every process that is started from here can be found."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def start(self, *arguments: str, folder: str, **changed: str) -> subprocess.Popen[str]:
-        (self.path / folder).mkdir(exist_ok=True)
-        return subprocess.Popen(
-            [sys.executable, "-m", "sauna", "study", "../mine.toml", *arguments],
-            cwd=self.path / folder,
-            env=os.environ | changed,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-
-    def finish(self, started: subprocess.Popen[str], code: int = 0) -> str:
-        out, errors = started.communicate(timeout=300)
-        assert started.returncode == code, out + errors
-        return out + errors
-
-    def processes(self) -> dict[Path, str]:
-        """Every process started from here that still runs, and its command line."""
-        found = {}
-        for entry in Path("/proc").glob("[0-9]*"):
-            try:
-                ours = f"{MARK}={self.path}".encode() in (entry / "environ").read_bytes()
-                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-            except OSError:
-                continue
-            if ours and line and int(entry.name) != os.getpid():
-                found[entry] = line
-        return found
-
-    def listening(self) -> set[str]:
-        """Addresses that these processes listen at, as the kernel writes them."""
-        sockets = set()
-        for entry in self.processes():
-            for descriptor in entry.glob("fd/*"):
-                with contextlib.suppress(OSError):
-                    sockets.add(os.readlink(descriptor))
-        rows = [
-            line.split()
-            for table in ("tcp", "tcp6")
-            for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
-        ]
-        listens = "0A"
-        return {
-            row[1].split(":")[0]
-            for row in rows
-            if row[3] == listens and f"socket:[{row[9]}]" in sockets
-        }
-
-
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
-    short = tempfile.mkdtemp(prefix="ray-")  # the paths of Ray's sockets have to be short
-    (tmp_path / "token").write_text("5" * 64)
-    (tmp_path / "nodes").mkdir()
-    for name, value in {
-        MARK: str(tmp_path),
-        "PYTHONPATH": TESTS,
-        "RAY_TMPDIR": short,
-        "TMPDIR": str(tmp_path / "nodes"),
-        "RAY_AUTH_MODE": "token",
-        "RAY_AUTH_TOKEN_PATH": str(tmp_path / "token"),
-    }.items():
-        monkeypatch.setenv(name, value)
-    yield Place(tmp_path)
-    shutil.rmtree(short, ignore_errors=True)
+    with on_ray(tmp_path, monkeypatch) as place:
+        yield place
 
 
-def until(true: Callable[[], Any], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.2)
-
-
-def kept(folder: Path) -> dict[str, bytes]:
-    """What of a study does not depend on a clock."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".png"]
-    apart = ("timing.jsonl", "manifest.json", ".lock", "stderr.txt", "report.html")
-    return {
-        str(p.relative_to(folder)): p.read_bytes() for p in sorted(files) if p.name not in apart
-    }
-
-
-def same(one: Path, other: Path) -> None:
-    found, expected = kept(one), kept(other)
-    assert found.keys() == expected.keys()
-    for name, data in expected.items():
-        assert found[name] == data, name
-    assert any(name.endswith("summary.json") for name in expected)
+def start(place: Place, *arguments: str, folder: str, **changed: str) -> subprocess.Popen[str]:
+    return place.start("study", "../mine.toml", *arguments, folder=folder, **changed)
 
 
 @slow
@@ -354,8 +261,8 @@ def test_a_lost_node_changes_nothing(place: Place, local: Path) -> None:
         remote = ("--processes=2", "--on=ray", f"--address={cluster.address}")
         (place.path / "wrong").write_text("6" * 64)
         wrong = str(place.path / "wrong")
-        refused = place.start(*remote, folder="refused", RAY_AUTH_TOKEN_PATH=wrong)
-        started = place.start(*remote, folder="cluster")
+        refused = start(place, *remote, folder="refused", RAY_AUTH_TOKEN_PATH=wrong)
+        started = start(place, *remote, folder="cluster")
         units = place.path / "cluster/runs/units"
 
         def half_way() -> bool:
@@ -390,7 +297,7 @@ def test_stopped_here_and_continued_on_this_machine(
     """On a Ray of our own: it listens on the loopback interface, and its token is for us only."""
     monkeypatch.delenv("RAY_AUTH_TOKEN_PATH")
     (place.path / "mine.toml").write_text(STUDY.format(steps=STEPS))
-    started = place.start("--processes=2", "--on=ray", folder="ray")
+    started = start(place, "--processes=2", "--on=ray", folder="ray")
     runs = place.path / "ray/runs"
     until(lambda: list(runs.glob("units/*/run/checkpoints/00000010")))
     (token,) = (place.path / "nodes").glob("sauna-*/token")
@@ -403,7 +310,7 @@ def test_stopped_here_and_continued_on_this_machine(
     assert not list((place.path / "nodes").iterdir())
     saved = [json.loads(p.read_text()) for p in runs.glob("units/*/run/summary.json")]
     assert saved and not any(summary["complete"] for summary in saved)
-    place.finish(place.start("--processes=2", folder="ray"))
+    place.finish(start(place, "--processes=2", folder="ray"))
     same(runs, local)
 
 
@@ -412,7 +319,7 @@ def test_stopped_here_and_continued_on_this_machine(
 def test_a_failing_seed_is_reported_and_the_others_complete(place: Place) -> None:
     text = STUDY.format(steps=1024).replace("Scripted", "Unlucky").replace("seeds = 4", "seeds = 2")
     (place.path / "mine.toml").write_text(text)
-    said = place.finish(place.start("--processes=2", "--on=ray", folder="ray"))
+    said = place.finish(start(place, "--processes=2", "--on=ray", folder="ray"))
     assert "FAILED: worlds:Unlucky, sauna, seed 1: " in said
     results = json.loads((place.path / "ray/runs/mine/results.json").read_text())
     for cell in results["cells"]:
@@ -449,7 +356,7 @@ def test_through_rays_client(place: Place, local: Path) -> None:
                 return asked.connect_ex(("127.0.0.1", port)) == 0
 
         until(answers)
-        place.finish(place.start("--processes=2", "--on=ray", address, folder="client"))
+        place.finish(start(place, "--processes=2", "--on=ray", address, folder="client"))
         assert server.poll() is None, "the cluster is not ours to end"
     finally:
         server.terminate()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from command_line import sauna_here
-from helpers import SMALL, Silent
+from helpers import Silent
 from sauna.api import train as train_run
 from sauna.experiments.tune import command, search, storage
 from sauna.experiments.tune.batch import prepared_batch
@@ -21,18 +21,9 @@ from sauna.experiments.tune.plan import make_plan
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted, SaunaError
 from sauna.training.prepare import prepare
+from tunings import GIVEN, SPACE, answers, tuned
 
 optuna = pytest.importorskip("optuna")
-
-ENV = "worlds:MatchingAction"
-GIVEN = {"env": ENV, **{k: v for k, v in SMALL.items() if k != "seeds"}, "preset": "discrete"}
-SPACE = """
-learning_rate = {low = 1e-4, high = 1e-1, log = true}
-gamma = [0.9, 0.99]
-epochs = [2]
-activation = ["tanh"]
-"""
-
 
 HOW: dict[str, Any] = {
     "trials": 2,
@@ -47,19 +38,6 @@ HOW: dict[str, Any] = {
 
 
 pytestmark = pytest.mark.usefixtures("no_page")
-
-
-def tuned(folder: Path, **options: Any) -> tuple[dict[str, Any], Path]:
-    """A small tuning; the number of its trials, and how many are in lockstep, are given."""
-    file = folder / "space.toml"
-    file.write_text(options.pop("space", SPACE))
-    options = {"space": str(file), "finalists": 1, "fresh_seeds": 0, "pruner": "none", **options}
-    given = {**GIVEN, **options.pop("given", {})}
-    return tune(given, folder, display=Silent, say=lambda text: None, jobs=1, **options)
-
-
-def answers(found: dict[str, Any]) -> list[Any]:
-    return [(t["state"], t["return"], t["searched"], t["curve"]) for t in found["trials"]]
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +197,7 @@ def test_the_journal_is_mended_after_a_write_that_was_cut(whole, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_what_was_found_is_tried_on_fresh_seeds(tmp_path: Path) -> None:
+def test_what_was_found_is_tried_on_fresh_seeds(tmp_path: Path, capsys) -> None:
     said: list[str] = []
     file = tmp_path / "space.toml"
     file.write_text(SPACE)
@@ -227,6 +205,8 @@ def test_what_was_found_is_tried_on_fresh_seeds(tmp_path: Path) -> None:
     given = {**GIVEN, "gamma": 0.5}
     found, folder = tune(given, tmp_path, display=Silent, say=said.append, jobs=1, **options)
     assert any("preset discrete cannot be trained with 128 env steps" in text for text in said)
+    printed = capsys.readouterr().out
+    assert printed.count("too few seeds") == 1 and "give at least --fresh-seeds 4" in printed
     table = {row["label"]: row for row in found["fresh"]["table"]}
     assert list(table) == ["start", "tuned"] and found["fresh_seeds"] == [1000, 1001]
     assert found["finalist_seeds"] == [1, 2, 3]
@@ -264,7 +244,8 @@ def test_the_fresh_seeds_compare_with_the_preset_that_the_task_has_by_itself() -
         (["A-v0", "--population-based", "--pruner", "none"], "pruner: not read with population"),
         (["A-v0", "--population-based", "--trials", "1"], "needs at least 2 members"),
         (["A-v0", "--space", "none.toml"], "no file none.toml"),
-        (["A-v0", "--on", "ray"], "on: a tuning trains on this machine"),
+        (["A-v0", "--on", "ray", "--population-based"], "on: a population is one program"),
+        (["A-v0", "--address", "auto"], "address: read with --on ray only"),
         (["CartPole-v1", "--arm", "ppo,sauna"], "arm: a tuning has one arm"),
         (["CartPole-v1", "--init-from", "runs/x"], "init_from: not read by a tuning"),
         (["CartPole-v1", "--stop", "none:such"], "stop: "),

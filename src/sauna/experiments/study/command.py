@@ -43,7 +43,7 @@ from sauna.experiments.study.units import (
 )
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted
-from sauna.system.signals import handled
+from sauna.system.signals import noted
 from sauna.system.working_folder import kept_folder
 from sauna.training.display import counted
 from sauna.training.prepare import examine, look_at, place
@@ -143,6 +143,7 @@ def study(
     address: str = "",
     quiet: bool = False,
     accept_changed_code: bool = False,
+    notes: Callable[[Spec], list[str]] = before_training,
 ) -> dict[str, Any]:
     """Trains what is missing of `spec` and writes results, summary, report and figures.
 
@@ -157,6 +158,7 @@ def study(
       address: of the cluster.
       quiet: show nothing.
       accept_changed_code: take runs of before as they are, even if their code is not what it was.
+      notes: lists what is to be said before anything is trained.
 
     Returns:
       the summary.
@@ -179,12 +181,12 @@ def study(
         _check_runs(spec)
     if on == "local":
         jobs = jobs or (1 if _on_gpu(spec) else cores())
-        return _train(LocalExecutor, spec, out, command, jobs, command, quiet, accept_changed_code)
+        how = jobs, command, quiet, accept_changed_code, notes
+        return _train(LocalExecutor, spec, out, command, *how)
     again = f"{command} --on {on}" + (f" --address {address}" if address else "")
     with ray_cluster.connected(address, jobs) as jobs:
-        return _train(
-            ray_cluster.RayExecutor, spec, out, command, jobs, again, quiet, accept_changed_code
-        )
+        how = jobs, again, quiet, accept_changed_code, notes
+        return _train(ray_cluster.RayExecutor, spec, out, command, *how)
 
 
 def _check_runs(spec: Spec) -> None:
@@ -226,6 +228,7 @@ def _train(
     again: str,
     quiet: bool,
     accept_changed_code: bool,
+    notes: Callable[[Spec], list[str]],
 ) -> dict[str, Any]:
     """The study on one kind of executor; `again` is the command that continues it there."""
     place, folder = out / spec.name, out / "units"
@@ -237,31 +240,30 @@ def _train(
         check_same_code(units, folder, accept_changed_code, say)
         reopen_damaged(units, folder, say)
         say(_opening(spec, place))
-        for note in before_training(spec):
+        for note in notes(spec):
             say(note)
-        noted: list[int] = []
+        with noted() as came:
 
-        def run(part: Spec, units: list[Unit]) -> None:
-            view = StudyView(part, units, folder, quiet)
-            view.open()
-            try:
-                executor(folder, jobs, view, lambda: bool(noted)).run(units)
-                view.close()
-                if part.measure:
-                    stopping, few = lambda: bool(noted), min(jobs, cores())
-                    measure(part, units, folder, place, few, view.say, stopping)
-            finally:
-                view.close()
+            def run(part: Spec, units: list[Unit]) -> None:
+                view = StudyView(part, units, folder, quiet)
+                view.open()
+                try:
+                    executor(folder, jobs, view, lambda: bool(came)).run(units)
+                    view.close()
+                    if part.measure:
+                        stopping, few = lambda: bool(came), min(jobs, cores())
+                        measure(part, units, folder, place, few, view.say, stopping)
+                finally:
+                    view.close()
 
-        with handled(partial(_note_signal, noted)):
             if spec.looks:
-                units = _run_looks(spec, size, folder, run, say, noted)
+                units = _run_looks(spec, size, folder, run, say, came)
             else:
                 run(spec, units)
     summary = write(spec, units, folder, place, command)
-    if noted:
-        name = signal.Signals(noted[0]).name
-        raise Interrupted(noted[0], f"stopped by {name}; continue with: {again}")
+    if came:
+        name = signal.Signals(came[0]).name
+        raise Interrupted(came[0], f"stopped by {name}; continue with: {again}")
     return summary
 
 
@@ -271,11 +273,11 @@ def _run_looks(
     folder: Path,
     run: Callable[[Spec, list[Unit]], None],
     say: Callable[[str], None],
-    noted: list[int],
+    came: list[int],
 ) -> list[Unit]:
     """Trains look by look until everything is decided, or a signal came; all units until then."""
     found = next_round(spec, size, folder)
-    while found.waiting is not None and not noted:
+    while found.waiting is not None and not came:
         seeds, arms = spec.looks[found.look].seeds, len(found.waiting.arms)
         up_to = f"{counted(arms, 'arm')} up to {counted(seeds, 'seed')}"
         say(f"look {found.look + 1} of {len(spec.looks)}: {up_to}")
@@ -297,13 +299,6 @@ def _opening(spec: Spec, place: Path) -> str:
         f"{spec.name}: {counted(len(spec.arms), 'arm')}, {counted(len(spec.tasks), 'task')}, "
         f"{most}{counted(members, 'member')}; writing to {place}"
     )
-
-
-def _note_signal(noted: list[int], number: int) -> None:
-    """The first signal lets the units save; the second one stops at once."""
-    if noted:
-        raise Interrupted(number, "stopped at once; running again continues")
-    noted.append(number)
 
 
 @contextmanager

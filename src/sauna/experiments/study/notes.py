@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sauna.config.parsing import many_seeds
-from sauna.config.settings import to_json
+from sauna.config.settings import flag, to_json
 from sauna.config.zoo import entry_for
 from sauna.experiments.statistics import compare
 from sauna.experiments.study.cells import Cell
@@ -13,12 +13,16 @@ from sauna.experiments.study.spec import Arm, Spec, check
 from sauna.experiments.study.verdicts import families_of, least_of
 
 
-def before_training(spec: Spec) -> list[str]:
-    """Says which presets are picked, and if seeds are too few for any difference, or very many."""
+def before_training(spec: Spec, seeds: str = "seeds") -> list[str]:
+    """Says which presets are picked, and if seeds are too few for any difference, or very many.
+
+    Args:
+      seeds: the option that says how many seeds there are.
+    """
     notes = [note for arm in spec.arms if (note := many_seeds(arm.seeds))]
     notes += [note for arm in spec.arms for note in _picked(arm)]
     for task in spec.tasks:
-        notes += _too_few(task, {arm.label: arm for arm in spec.arms if task in arm.tasks})
+        notes += _too_few(task, {arm.label: arm for arm in spec.arms if task in arm.tasks}, seeds)
     return list(dict.fromkeys(notes))
 
 
@@ -29,7 +33,7 @@ def _picked(arm: Arm) -> list[str]:
     return [entry.said(task, named) for task, entry in picked.items() if entry]
 
 
-def _too_few(task: str, arms: dict[str, Arm]) -> list[str]:
+def _too_few(task: str, arms: dict[str, Arm], seeds: str) -> list[str]:
     """Tries the tests with every score of an arm above every score of its baseline."""
     cells = [_cell(arm, task) for arm in arms.values()]
     short: dict[str, list[str]] = {}
@@ -42,7 +46,8 @@ def _too_few(task: str, arms: dict[str, Arm]) -> list[str]:
         short[baseline] = short.get(baseline, []) + few
     return [
         f"note: too few seeds: so few cannot show a difference between {baseline} and "
-        f"{', '.join(labels)} on {task}, whatever they are; give at least --seeds {least_of(cells)}"
+        f"{', '.join(labels)} on {task}, whatever they are; give at least "
+        f"{flag(seeds)} {least_of(cells)}"
         for baseline, labels in short.items()
         if labels
     ]

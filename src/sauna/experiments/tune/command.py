@@ -5,12 +5,14 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sauna.config.trust import seal
+from sauna.experiments.study.execute import ray_cluster
 from sauna.experiments.study.results import typed
 from sauna.experiments.tune import fresh, results, storage
 from sauna.experiments.tune.batch import Tuning
+from sauna.experiments.tune.on_cluster import ClusterSearch
 from sauna.experiments.tune.plan import PRUNERS, SEARCHES, Plan, make_plan
 from sauna.experiments.tune.population import Population, check_population
 from sauna.experiments.tune.search import Search
@@ -36,12 +38,29 @@ OPTIONS: dict[str, Any] = {
 OF_TRIALS = ("lockstep", "search", "pruner")  # not read by a population
 
 
+class Where(NamedTuple):
+    """Where a tuning trains; see `tune`."""
+
+    jobs: int
+    on: str
+    address: str
+
+    @property
+    def flags(self) -> str:
+        """What a user types to train there."""
+        if self.on == "local":
+            return ""
+        return f" --on {self.on}" + (f" --address {self.address}" if self.address else "")
+
+
 def tune(
     given: Mapping[str, Any],
     out: Path,
     *,
     trust: bool = False,
     jobs: int = 0,
+    on: str = "local",
+    address: str = "",
     accept_changed_code: bool = False,
     display: Callable[[], Display] = make_display,
     say: Callable[[str], None] = print,
@@ -53,8 +72,10 @@ def tune(
       given: settings of a run, from which the trials start, `env` among them.
       out: the folder in which that of the tuning is made, named after its settings.
       trust: the space may name code.
-      jobs: processes that share the trials of a batch, and fresh trainings at a time; 0: one per
-        core.
+      jobs: processes that share the trials of a batch, and fresh trainings at a time; on a cluster
+        trainings at a time; 0: one per core.
+      on: `local`, or `ray`: the Ray cluster at `address`, or a new one on this machine.
+      address: of the cluster.
       accept_changed_code: continue runs whose code is not what it was.
       display: makes what shows a training.
       say: is called with each line of the output.
@@ -73,8 +94,10 @@ def tune(
     values = load_space(options["space"], trust) if options["space"] else None
     if not options["population_based"]:
         storage.check_installed()
+    _check_where(on, address, options["population_based"])
     out = Path.cwd() / out
-    given = {**given, **({"processes": jobs} if jobs else {})}
+    if jobs and on == "local":  # a cluster may have another size when the tuning goes on
+        given = {**given, "processes": jobs}
     command = tune_command(given, out, options)
     with kept_folder():
         plan, start, said = make_plan(
@@ -100,21 +123,39 @@ def tune(
                 say(f"note: {note}")
             say(_opening(plan, place))
             tuning = Tuning(plan, start, place, display, accept_changed_code)
-            return _tune(tuning, command, jobs, say), place
+            return _tune(tuning, command, Where(jobs, on, address), say), place
 
 
-def _tune(tuning: Tuning, command: str, jobs: int, say: Callable[[str], None]) -> dict[str, Any]:
+def _check_where(on: str, address: str, population: bool) -> None:
+    """Refuses a place where the tuning cannot train.
+
+    Raises:
+      BadInput: naming the option.
+    """
+    if on == "local":
+        if address:
+            raise BadInput("address: read with --on ray only")
+    elif population:
+        raise BadInput(
+            "on: a population is one program, whose members wait for each other at every exchange; "
+            "it trains on this machine only"
+        )
+    else:
+        ray_cluster.check(address)
+
+
+def _tune(tuning: Tuning, command: str, where: Where, say: Callable[[str], None]) -> dict[str, Any]:
     plan, place = tuning.plan, tuning.folder
-    search = (Population if plan.exchange_every else Search)(tuning)
+    search = _search(tuning, where, say)
     try:
         with handled(_raise):
             search.run()
     except KeyboardInterrupt as error:  # what there is so far is kept, and shown
         results.write(plan, search, place, command)
         number = error.signal_number if isinstance(error, Interrupted) else 2
-        raise Interrupted(number, f"stopped; continue with: {command}") from None
+        raise Interrupted(number, f"stopped; continue with: {command}{where.flags}") from None
     written = results.write(plan, search, place, command)
-    how = {"jobs": jobs, "accept_changed_code": tuning.accept_changed_code}
+    how = {**where._asdict(), "accept_changed_code": tuning.accept_changed_code}
     if plan.finalists > 1:
         fresh.try_finalists(plan, written["trials"], place, command, **how)
         written = results.write(plan, search, place, command)
@@ -123,6 +164,12 @@ def _tune(tuning: Tuning, command: str, jobs: int, say: Callable[[str], None]) -
         fresh.evaluate(plan, written["best"]["settings"], place, command, **how)
         written = results.write(plan, search, place, command)
     return written
+
+
+def _search(tuning: Tuning, where: Where, say: Callable[[str], None]) -> Search | Population:
+    if where.on == "ray":
+        return ClusterSearch(tuning, where.jobs, where.address, say)
+    return (Population if tuning.plan.exchange_every else Search)(tuning)
 
 
 def _raise(number: int) -> None:

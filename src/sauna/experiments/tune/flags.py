@@ -106,16 +106,13 @@ def tune_from_flags(values: dict[str, Any], say: Callable[[str], None]) -> None:
     where = {name: values.pop(name) for name in own}
     if not values["env"]:
         raise BadInput("env: no environment given; try `sauna tune Pendulum-v1`")
-    if where["on"] != "local" or where["address"]:
-        raise BadInput(
-            "on: a tuning trains on this machine: its trials share one program and are pruned "
-            "while they train; `sauna study` runs on a cluster"
-        )
     found, folder = tune(
         values,
         Path(where["out"]),
         trust=where["trust"],
         jobs=jobs,
+        on=where["on"],
+        address=where["address"],
         accept_changed_code=where["accept_changed_code"],
         say=say,
         **options,

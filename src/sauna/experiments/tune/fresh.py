@@ -7,12 +7,14 @@ seeds, of which the best mean counts. What that leaves is tried on seeds that no
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import plain, resolve_run
 from sauna.config.settings import Config
 from sauna.experiments.study.command import study
+from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.spec import Spec, read_spec
 from sauna.experiments.study.units import digest_of, study_identity
 from sauna.experiments.tune.plan import Plan
@@ -121,7 +123,7 @@ def try_finalists(
     """
     finalists = finalists_of(plan, trials)
     if len(finalists) > 1:
-        study(finalists_spec(plan, finalists), folder, command, **place)
+        study(finalists_spec(plan, finalists), folder, command, notes=_no_notes, **place)
 
 
 def evaluate(
@@ -132,7 +134,13 @@ def evaluate(
     Raises:
       BadInput, Interrupted: as `study`.
     """
-    study(fresh_spec(plan, found), folder, command, **place)
+    notes = partial(before_training, seeds="fresh_seeds")
+    study(fresh_spec(plan, found), folder, command, notes=notes, **place)
+
+
+def _no_notes(spec: Spec) -> list[str]:
+    """Says nothing: the best mean of the finalists decides, and no test of a difference."""
+    return []
 
 
 def read_fresh(plan: Plan, found: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 batches/0003/batch.json     the numbers of its trials
 batches/0003/run            an ordinary run, whose arms are the trials
 batches/0003/trial-14       the same of one trial, of a batch whose run failed
+
+On a cluster trials are trained otherwise: see `on_cluster.py`.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class Search:
         self._plan, self._start, self._folder = plan, start, folder
         self._space: Space = plan.space
         self._forget_half_asked()
-        self.study = storage.open_study(folder, plan)
+        self.study, self._storage = storage.open_study(folder, plan)
 
     def run(self) -> None:
         """Trains every trial of the plan that has not ended.
@@ -112,6 +114,9 @@ class Search:
             }
         return list(numbers)
 
+    def _again(self, number: int) -> Trial:
+        return storage.again(self.study, self._storage, number)
+
     def _prepared(self, settings: Mapping[int, Mapping[str, Any]], out: Path) -> Prepared:
         plan = self._plan
         whole = {arm_of(number): {**plan.settings, **own} for number, own in settings.items()}
@@ -125,21 +130,23 @@ class Search:
             if error is None:
                 return
             if len(numbers) == 1:
-                self._fail(storage.again(self.study, numbers[0]), error, place / "run")
+                self._fail(self._again(numbers[0]), error, place / "run")
                 return
             run_directory.write_json(split, {"error": error})
         for number in numbers:
             path = place / arm_of(number)
             error = self._train_together(path, [number])
             if error is not None:
-                self._fail(storage.again(self.study, number), error, path)
+                self._fail(self._again(number), error, path)
 
     def _train_together(self, path: Path, numbers: list[int]) -> str | None:
         """Trains trials as one run and tells how they ended; returns why they failed, or None."""
-        trials = {number: storage.again(self.study, number) for number in numbers}
+        trials = {number: self._again(number) for number in numbers}
         settings = {n: trial.user_attrs[SETTINGS] for n, trial in trials.items()}
         prepared = self._prepared(settings, path)
         watch = Watch(trials, self._plan, prepared)
+        for row in run_directory.rows(path):  # of a run that goes on: its scores count
+            watch(row)
         if not run_directory.is_complete(path):
             try:
                 train(prepared, self._display(), watch, self._accept)
@@ -153,28 +160,31 @@ class Search:
         return None
 
     def _tell(self, path: Path, trials: Mapping[int, Trial], metric: str) -> None:
-        from optuna.trial import TrialState
-
         members = run_directory.read_config_file(path / "summary.json")["members"].values()
         for number, trial in trials.items():
             own = [member for member in members if member["arm"] == arm_of(number)]
             steps = sum(m["env_steps"] + m.get("eval_env_steps", 0) for m in own)
-            trial.set_user_attr(STEPS, steps)
-            values = [member[metric] for member in own if metric in member]
-            if PRUNED in trial.user_attrs:
-                self.study.tell(trial, state=TrialState.PRUNED)
-            elif len(values) < len(own):
-                self._fail(trial, "no episode has ended, so there is no return")
-            else:
-                self.study.tell(trial, float(np.mean(values)))
+            self._end(trial, [member[metric] for member in own if metric in member], steps)
+
+    def _end(self, trial: Trial, scores: list[float], steps: int) -> None:
+        """Tells how a trial ended: pruned, or with the scores of its members that have one."""
+        from optuna.trial import TrialState
+
+        trial.set_user_attr(STEPS, steps)
+        if PRUNED in trial.user_attrs:
+            self.study.tell(trial, state=TrialState.PRUNED)
+        elif len(scores) < len(self._plan.seeds):
+            self._fail(trial, "no episode has ended, so there is no return")
+        else:
+            self.study.tell(trial, float(np.mean(scores)))
 
     def _fail(self, trial: Trial, error: str, path: Path | None = None) -> None:
-        """Tells that a trial failed; `path` is the run in which it did, if it was trained."""
+        """Tells that a trial failed; `path` has the runs in which it did, if it was trained."""
         from optuna.trial import TrialState
 
         trial.set_user_attr(ERROR, error)
         if path is not None:
-            trial.set_user_attr(STEPS, steps_of(path))
+            trial.set_user_attr(STEPS, steps_below(path))
         self.study.tell(trial, state=TrialState.FAIL)
 
 

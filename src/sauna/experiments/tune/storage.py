@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from optuna import Study, Trial
     from optuna.pruners import BasePruner
     from optuna.samplers import BaseSampler
+    from optuna.storages import BaseStorage
 
 FILE = "optuna.journal"
 NAME = "sauna"
@@ -43,21 +44,23 @@ def check_installed() -> None:
         raise BadInput("tune: needs `pip install 'sauna-rl[tune]'`")
 
 
-def open_study(folder: Path, plan: Plan) -> Study:
-    """Opens the study of a tuning, or makes it."""
+def open_study(folder: Path, plan: Plan) -> tuple[Study, BaseStorage]:
+    """Opens the study of a tuning, or makes it; returns it and where it is stored."""
     import optuna
     from optuna.storages.journal import JournalFileBackend, JournalStorage
 
     cut(folder)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     with quiet():
-        return optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(folder / FILE))),
+        storage = JournalStorage(JournalFileBackend(str(folder / FILE)))
+        study = optuna.create_study(
+            storage=storage,
             study_name=NAME,
             direction="maximize",
             load_if_exists=True,
             pruner=_pruner(plan.pruner),
         )
+    return study, storage
 
 
 def size_of(folder: Path) -> int:
@@ -119,12 +122,13 @@ def ask(
     return trial
 
 
-def again(study: Study, number: int) -> Trial:
-    """Returns a trial that was asked for."""
+def again(study: Study, storage: BaseStorage, number: int) -> Trial:
+    """Returns a trial that was asked for, by this process or by one before it."""
     import optuna
 
+    stored = storage.get_study_id_from_name(NAME)
     with quiet():
-        return optuna.Trial(study, study.get_trials(deepcopy=False)[number]._trial_id)
+        return optuna.Trial(study, storage.get_trial_id_from_study_id_trial_number(stored, number))
 
 
 def importance(study: Study) -> dict[str, float]:

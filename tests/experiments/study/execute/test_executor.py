@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 from sauna.experiments.study.execute.display import DONE, FAILED, WAITING, Cell, StudyView
-from sauna.experiments.study.execute.executor import Executor
+from sauna.experiments.study.execute.executor import Executor, never
 from sauna.experiments.study.spec import check, read_spec
 from sauna.experiments.study.units import Unit, units_of
 from sauna.system import run_directory
@@ -28,9 +29,16 @@ class Broken(Executor):
 
     unlucky: int | None = 1
 
-    def __init__(self, folder: Path, view: StudyView, crashes: tuple[str, ...] = ()) -> None:
-        super().__init__(folder, 2, view, lambda: False)
+    def __init__(
+        self,
+        folder: Path,
+        view: StudyView,
+        crashes: tuple[str, ...] = (),
+        enough: Callable[[Unit], bool] = never,
+    ) -> None:
+        super().__init__(folder, 2, view, lambda: False, enough)
         self.starts: Counter[str] = Counter()
+        self.stopped: list[str] = []
         self._left = list(crashes)
 
     def _start(self, unit: Unit) -> None:
@@ -49,6 +57,9 @@ class Broken(Executor):
 
     def _tell_to_stop(self) -> None:
         pass
+
+    def _tell_one_to_stop(self, name: str) -> None:
+        self.stopped.append(name)
 
     def _close(self) -> None:
         pass
@@ -88,6 +99,26 @@ def test_a_failed_seed_tries_again_once_its_folder_is_removed(tmp_path: Path, mo
     run(tmp_path, TWO)
     assert run_directory.is_complete(places[0] / "run")
     assert list(tmp_path.rglob("failed.json")) == [places[1] / "failed.json"]
+
+
+class Endless(Broken):
+    """A unit runs until it is told to stop, and is not complete then."""
+
+    def _pump(self) -> None:
+        for name in self.stopped:
+            self._end(name, "stopped")
+        self.stopped.clear()
+
+
+def test_a_unit_that_has_trained_enough_is_stopped_and_is_no_failure(tmp_path: Path) -> None:
+    spec = read_spec(TWO)
+    ppo, sauna = units = units_of(spec, 3)
+    at_first = {sauna.name}
+    view = StudyView(spec, units, tmp_path)
+    executor = Endless(tmp_path, view, (), lambda unit: unit.name in {*at_first, *executor.starts})
+    executor.run(units)
+    assert executor.starts == {ppo.name: 1}
+    assert not list(tmp_path.rglob("failed.json")) and not list(tmp_path.rglob("split.json"))
 
 
 def test_two_labels_of_the_same_settings_are_one_unit(tmp_path: Path) -> None:

@@ -24,6 +24,11 @@ class View(Protocol):
     def refresh(self) -> None: ...
 
 
+def never(unit: Unit) -> bool:
+    """Says of no unit that it has trained enough: each is trained to its end."""
+    return False
+
+
 class Executor(ABC):
     """Runs units, `jobs` at a time; a subclass says where.
 
@@ -36,10 +41,20 @@ class Executor(ABC):
       jobs: units at a time.
       view: receives the progress.
       stopping: whether to end; running units then finish their iteration and save.
+      enough: whether a unit is over although it is not complete; one that runs then finishes its
+        iteration and saves.
     """
 
-    def __init__(self, folder: Path, jobs: int, view: View, stopping: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        jobs: int,
+        view: View,
+        stopping: Callable[[], bool],
+        enough: Callable[[Unit], bool] = never,
+    ) -> None:
         self._folder, self._jobs, self._view, self._stopping = folder, jobs, view, stopping
+        self._enough = enough
         self._waiting: list[Unit] = []
         self._running: dict[str, Unit] = {}
         self._attempts: dict[str, int] = {}
@@ -54,6 +69,9 @@ class Executor(ABC):
                 if self._stopping():
                     self._waiting.clear()
                     self._tell_to_stop()
+                for name, unit in self._running.items():
+                    if self._enough(unit):
+                        self._tell_one_to_stop(name)
                 self._fill()
                 self._pump()
                 self._view.refresh()
@@ -76,11 +94,16 @@ class Executor(ABC):
         """Lets every running unit finish its iteration and save; may be called again."""
 
     @abstractmethod
+    def _tell_one_to_stop(self, name: str) -> None:
+        """Lets the running unit `name` finish its iteration and save; may be called again."""
+
+    @abstractmethod
     def _close(self) -> None:
         """Leaves nothing behind that is still running."""
 
     def _is_over(self, unit: Unit) -> bool:
-        return unit.is_complete(self._folder) or unit.error(self._folder) is not None
+        failed = unit.error(self._folder) is not None
+        return failed or unit.is_complete(self._folder) or self._enough(unit)
 
     def _fill(self) -> None:
         """Starts units until every job has one, or none waits."""
@@ -104,7 +127,7 @@ class Executor(ABC):
         self._view.stopped(unit)
         if unit.is_complete(self._folder):
             self._view.ended(unit, None)
-        elif not self._stopping():
+        elif not self._stopping() and not self._enough(unit):
             self._attempts[name] = self._attempts.get(name, 0) + 1
             if self._attempts[name] < ATTEMPTS:
                 self._waiting.insert(0, unit)

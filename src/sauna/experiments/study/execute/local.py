@@ -6,7 +6,7 @@ import queue
 from collections.abc import Callable
 from pathlib import Path
 
-from sauna.experiments.study.execute.executor import Executor, View
+from sauna.experiments.study.execute.executor import Executor, View, never
 from sauna.experiments.study.execute.process import Message, UnitProcess
 from sauna.experiments.study.units import Unit
 from sauna.system.safe_write import own_folder
@@ -15,8 +15,15 @@ from sauna.system.safe_write import own_folder
 class LocalExecutor(Executor):
     """Runs units in `jobs` processes at a time."""
 
-    def __init__(self, folder: Path, jobs: int, view: View, stopping: Callable[[], bool]) -> None:
-        super().__init__(folder, jobs, view, stopping)
+    def __init__(
+        self,
+        folder: Path,
+        jobs: int,
+        view: View,
+        stopping: Callable[[], bool],
+        enough: Callable[[Unit], bool] = never,
+    ) -> None:
+        super().__init__(folder, jobs, view, stopping, enough)
         self._messages: queue.SimpleQueue[tuple[str, Message | None]] = queue.SimpleQueue()
         self._processes: dict[str, UnitProcess] = {}
         self._errors: dict[str, str] = {}
@@ -47,6 +54,9 @@ class LocalExecutor(Executor):
     def _tell_to_stop(self) -> None:
         for process in self._processes.values():
             process.stop()
+
+    def _tell_one_to_stop(self, name: str) -> None:
+        self._processes[name].stop()
 
     def _close(self) -> None:
         self._tell_to_stop()

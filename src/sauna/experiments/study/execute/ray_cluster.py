@@ -2,7 +2,7 @@
 
 Ray starts a task again when its node or process is lost; the task then continues from the files
 that had arrived, so that one checkpoint interval is lost at most. Which unit runs when, and what
-becomes of one that fails, is as on one machine: see `schedule.py`. `node.py` runs on the nodes.
+becomes of one that fails, is as on one machine: see `executor.py`. `ray_node.py` runs on the nodes.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
 from sauna import __version__
 from sauna.config.trust import seal
 from sauna.experiments.study.execute import ray_files
-from sauna.experiments.study.execute.executor import Executor, View
+from sauna.experiments.study.execute.executor import Executor, View, never
 from sauna.experiments.study.execute.ray_node import Hub, Said, run_unit, version
 from sauna.experiments.study.units import Unit
 from sauna.system import run_directory
@@ -33,6 +34,7 @@ TOKENS = (
     "(its token belongs into the file RAY_AUTH_TOKEN_PATH or ~/.ray/auth_token; "
     "of a cluster without one, set RAY_AUTH_MODE=disabled)"
 )
+TOKEN_PATH = "RAY_AUTH_TOKEN_PATH"
 QUIET = {"log_to_driver": False, "logging_level": "ERROR"}
 
 
@@ -82,14 +84,22 @@ def connected(address: str, jobs: int) -> Iterator[int]:
             import ray
 
             ray.shutdown()
+            if os.environ.get(TOKEN_PATH) == str(Path(private) / "token"):
+                del os.environ[TOKEN_PATH]  # the next one here writes its own file
+
+
+@cache
+def _token() -> str:
+    """The token of every Ray that this process starts: Ray reads it once per process."""
+    return secrets.token_hex(32)
 
 
 def _start_here(private: Path, jobs: int) -> None:
     """A Ray of our own that listens on the loopback interface only, without a dashboard."""
-    if not os.environ.keys() & {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}:
+    if not os.environ.keys() & {"RAY_AUTH_TOKEN", TOKEN_PATH}:
         (private / "token").touch(mode=0o600)
-        (private / "token").write_text(secrets.token_hex(32))
-        os.environ["RAY_AUTH_TOKEN_PATH"] = str(private / "token")
+        (private / "token").write_text(_token())
+        os.environ[TOKEN_PATH] = str(private / "token")
     # On Linux, Ray replaces a loopback address by one that other machines reach, unless it is set
     # that this is no cluster. The variable has this name everywhere; Ray reads it when imported.
     os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
@@ -138,8 +148,15 @@ def _cores() -> int:
 class RayExecutor(Executor):
     """Runs units as Ray tasks of one core each; needs a connection, see `connected`."""
 
-    def __init__(self, folder: Path, jobs: int, view: View, stopping: Callable[[], bool]) -> None:
-        super().__init__(folder, jobs, view, stopping)
+    def __init__(
+        self,
+        folder: Path,
+        jobs: int,
+        view: View,
+        stopping: Callable[[], bool],
+        enough: Callable[[Unit], bool] = never,
+    ) -> None:
+        super().__init__(folder, jobs, view, stopping, enough)
         import ray
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as On
 
@@ -155,6 +172,7 @@ class RayExecutor(Executor):
         self._locks: dict[str, IO[str]] = {}
         self._git = run_directory.git_revision()
         self._told = False
+        self._told_one: set[str] = set()
 
     def _start(self, unit: Unit) -> None:
         run = unit.run(self._folder)
@@ -213,7 +231,7 @@ class RayExecutor(Executor):
         """Sends a task what it begins with: the files of the unit that there are."""
         place = self._folder / unit.name
         files = None
-        if not self._stopping():
+        if not self._stopping() and not self._enough(unit):
             files = ray_files.read(place, ray_files.names(place))
             if unit.name in self._began:
                 iteration = int((ray_files.checkpoints(place) or ["0"])[-1])
@@ -229,6 +247,11 @@ class RayExecutor(Executor):
             for ref, name in self._tasks.items():
                 if name not in self._began:  # Ray has no core for it yet
                     self._ray.cancel(ref)
+
+    def _tell_one_to_stop(self, name: str) -> None:
+        if name not in self._told_one:
+            self._told_one.add(name)
+            self._hub.stop_one.remote(name)
 
     def _close(self) -> None:
         for lock in self._locks.values():

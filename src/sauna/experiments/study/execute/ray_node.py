@@ -48,6 +48,7 @@ class Hub:
         self._attempts: dict[str, int] = {}
         self._answers: dict[str, asyncio.Future[dict[str, bytes] | None]] = {}
         self._stopping = False
+        self._enough: set[str] = set()
 
     async def begin(self, name: str) -> tuple[int, dict[str, bytes] | None]:
         """Returns to a task its attempt and the files to begin with; None if it should not
@@ -65,7 +66,7 @@ class Hub:
             return True
         if messages or changes is not None:
             await self._said.put(Said(name, False, messages, changes))
-        return self._stopping
+        return self._stopping or name in self._enough
 
     async def take(self, seconds: float) -> list[Said]:
         """Returns to the study every message, after `seconds` at the latest."""
@@ -87,6 +88,10 @@ class Hub:
         """Asks every task to finish its iteration and save."""
         self._stopping = True
 
+    async def stop_one(self, name: str) -> None:
+        """Asks the task of one unit to finish its iteration and save."""
+        self._enough.add(name)
+
 
 def run_unit(hub: Any, name: str, overrides: dict[str, Any], recorded: dict[str, Any]) -> str:
     """Trains or continues a unit.
@@ -104,7 +109,7 @@ def run_unit(hub: Any, name: str, overrides: dict[str, Any], recorded: dict[str,
 
     attempt, files = ray.get(hub.begin.remote(name))
     if files is None:
-        return "the study is stopping"
+        return "it is not to begin: all stops, or it has trained enough"
     with tempfile.TemporaryDirectory(prefix="sauna-", ignore_cleanup_errors=True) as folder:
         place = Path(folder)
         write(place, files)

@@ -33,7 +33,15 @@ from sauna.training import run as runs
 from sauna.training.train import train_run
 
 PATIENCE = 300.0  # seconds that a run may still be locked by a process that is ending
-SHOWN = ("seed", "env_steps", "kept_steps", "return_mean", "keep_rate", "sample_rate")
+SHOWN = (
+    "seed",
+    "env_steps",
+    "kept_steps",
+    "return_mean",
+    "eval_return_mean",
+    "keep_rate",
+    "sample_rate",
+)
 
 
 class LineDisplay:
