@@ -91,7 +91,7 @@ class Place:
 
 @contextmanager
 def on_ray(path: Path, patched: pytest.MonkeyPatch) -> Iterator[Place]:
-    """Lets what is started from `path` find the environments of `worlds.py`, and Ray a token."""
+    """Lets what is started from `path` find `small_envs.py`, and Ray a token."""
     short = tempfile.mkdtemp(prefix="ray-")  # the paths of Ray's sockets have to be short
     (path / "token").write_text("5" * 64)
     (path / "nodes").mkdir()

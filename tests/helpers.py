@@ -33,7 +33,7 @@ TESTS = str(Path(__file__).parent)
 
 
 def environment() -> dict[str, str]:
-    """Of a process that finds the environments of `worlds.py`."""
+    """Of a process that finds the environments of `small_envs.py`."""
     path = [TESTS, *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 

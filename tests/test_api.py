@@ -21,7 +21,7 @@ from sauna.experiments.report.curve import interval, member_curves
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
-from worlds import Finite, Scripted
+from small_envs import Finite, Scripted
 
 ROOT = Path(__file__).parent.parent
 pytestmark = pytest.mark.draws
@@ -56,7 +56,7 @@ LISTED = Listed()
 def result(tmp_path_factory):
     run = tmp_path_factory.mktemp("api") / "run"
     return sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         quiet=True,
         out=run,
         track=["tensorboard", LISTED],
@@ -120,8 +120,8 @@ def test_config_json_says_everything(result) -> None:
 def test_the_policy_acts_as_in_training(result) -> None:
     """Normalised by hand, with the stored parameters, in plain numpy."""
     artifact = load_artifact(result.path)
-    policy, world = TrainedPolicy(artifact, 1), Scripted()
-    observation, _ = world.reset(seed=3)
+    policy, env = TrainedPolicy(artifact, 1), Scripted()
+    observation, _ = env.reset(seed=3)
     arrays = own(artifact.checkpoint.arrays, "sauna/1")
     arrays = {name.removeprefix("/"): value for name, value in arrays.items()}
     last = [row for row in result.metrics if row["member"] == "sauna/1"][-1]
@@ -216,7 +216,9 @@ import sauna
 
 with open("times.txt", "a") as file:
     file.write("run\\n")
-result = sauna.train("worlds:Scripted", quiet=True, out="run", arm="ppo", processes=2, {settings})
+result = sauna.train(
+    "small_envs:Scripted", quiet=True, out="run", arm="ppo", processes=2, {settings}
+)
 print(len(result.metrics), result.table().shape if hasattr(result.table(), "shape") else "")
 """
 
@@ -242,7 +244,7 @@ def test_a_script_needs_no_main_guard(tmp_path) -> None:
 @pytest.mark.processes
 def test_functions_and_lambdas_as_environments(tmp_path, capsys) -> None:
     named = sauna.train(Scripted, quiet=True, out=tmp_path / "named", **SMALL)
-    assert run_directory.read_config(named.path)["config"]["env"] == "worlds:Scripted"
+    assert run_directory.read_config(named.path)["config"]["env"] == "small_envs:Scripted"
     local = sauna.train(lambda: Scripted(), quiet=True, out=tmp_path / "local", **SMALL)
     assert local.metrics == named.metrics
 
@@ -252,7 +254,7 @@ def test_videos_are_written_and_read_back(tmp_path) -> None:
     import imageio.v3 as imageio
 
     run = sauna.train(
-        "worlds:Picture",
+        "small_envs:Picture",
         quiet=True,
         out=tmp_path / "run",
         arm="ppo",
@@ -279,7 +281,7 @@ def test_no_video_is_said_plainly(result) -> None:
 
 def test_environments_in_worker_processes_train_to_the_same_bytes(result, tmp_path) -> None:
     other = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         quiet=True,
         out=tmp_path / "run",
         env_processes=2,
@@ -312,11 +314,11 @@ def test_the_plugin_of_the_docs_runs(tmp_path) -> None:
 @pytest.mark.parametrize("name", ["smoothed", "by_numpy"])
 def test_filters_of_ones_own_may_be_plain(name: str, tmp_path) -> None:
     run = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         quiet=True,
         out=tmp_path / "run",
         arm="sauna",
-        filter=f"jax_worlds:{name}",
+        filter=f"jax_envs:{name}",
         **SMALL,
     )
     assert all(0 < row["keep_rate"] <= 1 for row in run.metrics)
@@ -328,7 +330,7 @@ def test_the_target_of_the_docs_runs(tmp_path, monkeypatch) -> None:
     (tmp_path / "my_targets.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     run = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         quiet=True,
         out=tmp_path / "run",
         arm="vex-head",
@@ -346,7 +348,7 @@ def test_python_values_of_all_kinds_are_taken(tmp_path) -> None:
         "learning_rate": np.float32(1),
     }
     run = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         quiet=True,
         out=tmp_path / "run",
         arm=["ppo"],
@@ -377,7 +379,7 @@ def test_a_live_table_shows_the_members(monkeypatch, capsys, tmp_path) -> None:
     shown = display.make_display()
     assert isinstance(shown, display.LiveDisplay)
     sauna_run = sauna.api.runs.start(
-        {"env": "worlds:Finite", "arm": "sauna", "out": str(tmp_path / "run"), **SMALL}, shown
+        {"env": "small_envs:Finite", "arm": "sauna", "out": str(tmp_path / "run"), **SMALL}, shown
     )
     sauna.api.train_and_draw(sauna_run, shown, resume=False)
     text = capsys.readouterr().out

@@ -20,88 +20,91 @@ from sauna.config.task_presets import TASK_PRESETS
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 
-WORLD = "worlds:Scripted"
+ENV = "small_envs:Scripted"
 
 
 BAD = [
     (["train", "HalfCheeta-v5"], "did you mean 'HalfCheetah-v5'?"),
-    (["train", WORLD, "--arm", "suana"], "did you mean 'sauna'?"),
-    (["train", WORLD, "--preset", "mujco"], "did you mean 'mujoco'?"),
-    (["train", WORLD, "--treshold", "0.2"], "did you mean '--threshold'?"),
-    (["train", WORLD, "--threshold"], "expected one argument"),
-    (["train", WORLD, "--arm", "sauna", "--filter", "sanua"], "did you mean 'sauna'?"),
-    (["train", WORLD, "--arm", "sauna", "--filter", "nowhere:it"], "cannot import 'nowhere'"),
-    (["train", WORLD, "--minibatches", "33"], "33 does not divide rollout_steps x envs = 2048"),
-    (["train", WORLD, "--steps", "-5"], "steps: must be at least 1"),
-    (["train", WORLD, "--steps", "100"], "less than one rollout"),
-    (["train", WORLD, "--steps", "1.5"], "steps: cannot read '1.5' as a whole number"),
-    (["train", WORLD, "--seeds", "0"], "seeds: empty"),
-    (["train", WORLD, "--seeds", "1,1"], "seed is given twice"),
-    (["train", WORLD, "--seeds=-1,2"], "seeds: must lie between"),
-    (["train", WORLD, "--gamma", "1.1"], "gamma: must be at most 1"),
-    (["train", WORLD, "--gamma", "nan"], "gamma: must be a finite number"),
-    (["train", WORLD, "--hidden", ""], "hidden: cannot read"),
-    (["train", WORLD, "--env-kwargs", '{"a": [0, Infinity]}'], "JSON has no infinity and no NaN"),
-    (["train", WORLD, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
-    (["train", WORLD, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
-    (["train", WORLD, "--arm", "random-drop"], "random-drop needs a rate"),
-    (["train", WORLD, "--drop-rate-from", "RUN"], "--drop-rate-from"),
-    (["train", WORLD, "--arm", "sauna", "--gae-over", "kept"], "kept needs truncation=terminate"),
-    (["train", WORLD, "--network", "nature-cnn"], "does not fit vector observations"),
-    (["train", WORLD, "--env-processes", "3"], "more worker processes than environments"),
-    (["train", "worlds:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
-    (["train", "worlds:Picture", "--hidden", "8"], "hidden: not read"),
-    (["train", WORLD, "--seeds", "123456"], "for the one seed 123456 write --seed 123456"),
-    (["train", WORLD, "--arm", "sauna", "--filter", "worlds:Scripted"], "not a sauna.StepFilter"),
+    (["train", ENV, "--arm", "suana"], "did you mean 'sauna'?"),
+    (["train", ENV, "--preset", "mujco"], "did you mean 'mujoco'?"),
+    (["train", ENV, "--treshold", "0.2"], "did you mean '--threshold'?"),
+    (["train", ENV, "--threshold"], "expected one argument"),
+    (["train", ENV, "--arm", "sauna", "--filter", "sanua"], "did you mean 'sauna'?"),
+    (["train", ENV, "--arm", "sauna", "--filter", "nowhere:it"], "cannot import 'nowhere'"),
+    (["train", ENV, "--minibatches", "33"], "33 does not divide rollout_steps x envs = 2048"),
+    (["train", ENV, "--steps", "-5"], "steps: must be at least 1"),
+    (["train", ENV, "--steps", "100"], "less than one rollout"),
+    (["train", ENV, "--steps", "1.5"], "steps: cannot read '1.5' as a whole number"),
+    (["train", ENV, "--seeds", "0"], "seeds: empty"),
+    (["train", ENV, "--seeds", "1,1"], "seed is given twice"),
+    (["train", ENV, "--seeds=-1,2"], "seeds: must lie between"),
+    (["train", ENV, "--gamma", "1.1"], "gamma: must be at most 1"),
+    (["train", ENV, "--gamma", "nan"], "gamma: must be a finite number"),
+    (["train", ENV, "--hidden", ""], "hidden: cannot read"),
+    (["train", ENV, "--env-kwargs", '{"a": [0, Infinity]}'], "JSON has no infinity and no NaN"),
+    (["train", ENV, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
+    (["train", ENV, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
+    (["train", ENV, "--arm", "random-drop"], "random-drop needs a rate"),
+    (["train", ENV, "--drop-rate-from", "RUN"], "--drop-rate-from"),
+    (["train", ENV, "--arm", "sauna", "--gae-over", "kept"], "kept needs truncation=terminate"),
+    (["train", ENV, "--network", "nature-cnn"], "does not fit vector observations"),
+    (["train", ENV, "--env-processes", "3"], "more worker processes than environments"),
+    (["train", "small_envs:Spaced", "--env-kwargs", '{"action": "tuple"}'], "is not supported"),
+    (["train", "small_envs:Picture", "--hidden", "8"], "hidden: not read"),
+    (["train", ENV, "--seeds", "123456"], "for the one seed 123456 write --seed 123456"),
+    (["train", ENV, "--arm", "sauna", "--filter", "small_envs:Scripted"], "not a sauna.StepFilter"),
     (
-        ["train", WORLD, "--arm", "sauna", "--vex-target", "worlds:Scripted"],
+        ["train", ENV, "--arm", "sauna", "--vex-target", "small_envs:Scripted"],
         "is not a sauna.VexTarget",
     ),
-    (["train", WORLD, "--network", "worlds:Scripted"], "is not a flax.linen module"),
-    (["train", "worlds:ConstantReward", "--log-std-init", "1"], "log_std_init: not read"),
-    (["train", "worlds:Picture", "--normalize-observations"], "have no running moments"),
-    (["train", "worlds:Misshapen"], "of shape (3,), and gives (1,)"),
-    (["train", "worlds:Misshapen", "--env-kwargs", '{"size": 4}'], "shape (3,), and gives (4,)"),
+    (["train", ENV, "--network", "small_envs:Scripted"], "is not a flax.linen module"),
+    (["train", "small_envs:ConstantReward", "--log-std-init", "1"], "log_std_init: not read"),
+    (["train", "small_envs:Picture", "--normalize-observations"], "have no running moments"),
+    (["train", "small_envs:Misshapen"], "of shape (3,), and gives (1,)"),
     (
-        ["train", WORLD, "--arm", "sauna", "--filter", "jax_worlds:misspelt"],
+        ["train", "small_envs:Misshapen", "--env-kwargs", '{"size": 4}'],
+        "shape (3,), and gives (4,)",
+    ),
+    (
+        ["train", ENV, "--arm", "sauna", "--filter", "jax_envs:misspelt"],
         "has no attribute 'treshold'",
     ),
     (
-        ["train", WORLD, "--arm", "sauna", "--filter", "jax_worlds:too_long"],
+        ["train", ENV, "--arm", "sauna", "--filter", "jax_envs:too_long"],
         "a mask of shape (2,) and type bool",
     ),
     (
-        ["train", WORLD, "--arm", "sauna", "--filter", "jax_worlds:forgetting"],
+        ["train", ENV, "--arm", "sauna", "--filter", "jax_envs:forgetting"],
         "a state of other arrays",
     ),
     (
-        ["train", WORLD, "--arm", "sauna", "--vex-target", "jax_worlds:summed"],
+        ["train", ENV, "--arm", "sauna", "--vex-target", "jax_envs:summed"],
         "gives shape () instead of (2048, 1)",
     ),
-    (["train", "worlds:Broken", "--env-kwargs", '{"broken": "step"}'], "cannot be played"),
-    (["train", WORLD, "--threshold", "0.8"], "threshold: not read by arm ppo"),
-    (["train", WORLD, "--n-steps", "64"], "here it is '--rollout-steps': kept steps"),
-    (["train", WORLD, "--num_envs=4"], "here it is '--envs': environments per member"),
-    (["train", WORLD, "--lr", "1e-3"], "here it is '--learning-rate'"),
-    (["train", WORLD, "--total-timesteps", "1e6"], "here it is '--steps'"),
-    (["train", WORLD, "--batch-size", "100"], "batch_size: 100 does not divide"),
-    (["train", WORLD, "--batch-size", "0"], "batch_size: 0 does not divide"),
-    (["train", WORLD, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
-    (["train", WORLD, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
-    (["train", WORLD, "--target-kl", "0"], "target_kl: must be a number above 0"),
-    (["train", WORLD, "--target-kl", "x"], "target_kl: cannot read 'x' as float"),
-    (["train", WORLD, "--target-kl", "0.01", "--stop", "espo"], "either target_kl or stop"),
-    (["train", WORLD, "--target-kl", "0.01", "--algorithm", "a2c"], "stop: not read"),
-    (["train", WORLD, "--optimizer", "adamv"], "did you mean 'adam'"),
-    (["train", WORLD, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),
+    (["train", "small_envs:Broken", "--env-kwargs", '{"broken": "step"}'], "cannot be played"),
+    (["train", ENV, "--threshold", "0.8"], "threshold: not read by arm ppo"),
+    (["train", ENV, "--n-steps", "64"], "here it is '--rollout-steps': kept steps"),
+    (["train", ENV, "--num_envs=4"], "here it is '--envs': environments per member"),
+    (["train", ENV, "--lr", "1e-3"], "here it is '--learning-rate'"),
+    (["train", ENV, "--total-timesteps", "1e6"], "here it is '--steps'"),
+    (["train", ENV, "--batch-size", "100"], "batch_size: 100 does not divide"),
+    (["train", ENV, "--batch-size", "0"], "batch_size: 0 does not divide"),
+    (["train", ENV, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
+    (["train", ENV, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
+    (["train", ENV, "--target-kl", "0"], "target_kl: must be a number above 0"),
+    (["train", ENV, "--target-kl", "x"], "target_kl: cannot read 'x' as float"),
+    (["train", ENV, "--target-kl", "0.01", "--stop", "espo"], "either target_kl or stop"),
+    (["train", ENV, "--target-kl", "0.01", "--algorithm", "a2c"], "stop: not read"),
+    (["train", ENV, "--optimizer", "adamv"], "did you mean 'adam'"),
+    (["train", ENV, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),
     (
-        ["train", WORLD, "--seeds", "1.5"],
+        ["train", ENV, "--seeds", "1.5"],
         "seeds: cannot read '1.5' as a count (6 are the seeds 0 to 5)",
     ),
-    (["train", WORLD, "--env-kwargs", "[1]"], "cannot read '[1]' as a JSON object, such as '{"),
-    (["train", WORLD, "--lr-schedule", "x"], "here it is '--learning-rate-schedule'"),
-    (["train", WORLD, "--seed", "1,2"], "seed: cannot read '1,2' as a whole number"),
-    (["compare", WORLD, "--ent-coef", "0.1"], "here it is '--entropy-coef'"),
+    (["train", ENV, "--env-kwargs", "[1]"], "cannot read '[1]' as a JSON object, such as '{"),
+    (["train", ENV, "--lr-schedule", "x"], "here it is '--learning-rate-schedule'"),
+    (["train", ENV, "--seed", "1,2"], "seed: cannot read '1,2' as a whole number"),
+    (["compare", ENV, "--ent-coef", "0.1"], "here it is '--entropy-coef'"),
     (["resume", "nothere", "--gamma", "0.9"], "a resumed run computes what it began with"),
     (["resume", "nothere", "--total-timesteps", "9"], "here it is '--steps'"),
     (["resume", "nothere", "--n-steps", "9"], "a resumed run computes what it began with"),
@@ -116,7 +119,7 @@ BAD = [
     (["inspect", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
     (["inspect", "nothere", "--frames"], "did you mean '--no-frames'?"),
     (["list", "foo"], "invalid choice"),
-    (["trian", WORLD], "invalid choice: 'trian'"),
+    (["trian", ENV], "invalid choice: 'trian'"),
 ]
 
 
@@ -150,9 +153,7 @@ def test_bad_input_is_found_without_importing_jax(tmp_path) -> None:
 
 def test_train_resume_eval_and_list_together(tmp_path) -> None:
     run = tmp_path / "run"
-    done = sauna(
-        "train", WORLD, "--out", str(run), *small_flags(seeds=2, arm="sauna"), cwd=tmp_path
-    )
+    done = sauna("train", ENV, "--out", str(run), *small_flags(seeds=2, arm="sauna"), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "compiling" in done.stdout and "sauna/1: return" in done.stdout
     assert {p.name for p in run.iterdir()} == {
@@ -166,7 +167,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
         "timing.jsonl",
     }
     assert (run / "figures" / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
-    again = sauna("train", WORLD, "--out", str(run), cwd=tmp_path)
+    again = sauna("train", ENV, "--out", str(run), cwd=tmp_path)
     assert again.returncode == 2 and f"sauna resume {run}" in again.stderr
     assert "nothing to do" in sauna_here("resume", str(run), cwd=tmp_path).stdout
     for mode in ("sampled", "deterministic"):
@@ -179,7 +180,7 @@ def test_train_resume_eval_and_list_together(tmp_path) -> None:
         assert stored["mode"] == mode and len(stored["members"]["sauna/0"]["returns"]) == 3
     done = sauna_here("eval", str(run), "--member", "sauna/7", cwd=tmp_path)
     assert done.returncode == 2 and "did you mean 'sauna/" in done.stderr
-    done = sauna_here("eval", str(run), "--env", "worlds:Endless", cwd=tmp_path)
+    done = sauna_here("eval", str(run), "--env", "small_envs:Endless", cwd=tmp_path)
     assert done.returncode == 2 and "other spaces than the run: observation shape" in done.stderr
 
 
@@ -202,7 +203,7 @@ def test_lists(what: str, word: str, capsys: pytest.CaptureFixture[str]) -> None
 def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> None:
     flags = small_flags(arm="sauna", threshold=0.7, seeds="4,9", envs=2)
     first, second = tmp_path / "first", tmp_path / "second"
-    assert sauna("train", WORLD, "--out", str(first), *flags).returncode == 0
+    assert sauna("train", ENV, "--out", str(first), *flags).returncode == 0
     done = sauna("train", "--config", str(first / "config.json"), "--out", str(second))
     assert done.returncode == 0, done.stderr
     assert (first / "metrics.jsonl").read_bytes() == (second / "metrics.jsonl").read_bytes()
@@ -214,7 +215,7 @@ def test_the_same_command_gives_the_same_run_and_config_repeats_it(tmp_path) -> 
 
 
 def test_a_value_edited_in_config_json_counts() -> None:
-    stored = to_stored(resolve_run({"env": WORLD, "arm": "ppo,sauna", "seeds": "2"}))
+    stored = to_stored(resolve_run({"env": ENV, "arm": "ppo,sauna", "seeds": "2"}))
     stored["config"] |= {"threshold": 0.9, "processes": 2, "out": "there"}
     again = overrides_of(read_stored(stored))
     assert resolve(again).threshold == 0.9
@@ -278,10 +279,10 @@ def test_one_seed_and_samples_per_minibatch() -> None:
 
 def test_seed_and_batch_size_replace_what_a_file_says(tmp_path) -> None:
     file = tmp_path / "settings.json"
-    file.write_text(json.dumps({"env": WORLD, "seeds": [1, 2], "minibatches": 4}))
+    file.write_text(json.dumps({"env": ENV, "seeds": [1, 2], "minibatches": 4}))
     typed = {"seed": "7", "batch_size": "256"}
     merged = translate(cli._over(cli._overrides_in(str(file), trust=True), typed))
-    assert merged == {"env": WORLD, "seeds": (7,), "minibatches": 8}
+    assert merged == {"env": ENV, "seeds": (7,), "minibatches": 8}
 
 
 def test_what_a_large_count_of_seeds_means_is_said() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from helpers import SMALL, Silent
 from sauna.experiments.tune.command import tune
 
-ENV = "worlds:MatchingAction"
+ENV = "small_envs:MatchingAction"
 GIVEN = {"env": ENV, **{k: v for k, v in SMALL.items() if k != "seeds"}, "preset": "discrete"}
 SPACE = """
 learning_rate = {low = 1e-4, high = 1e-1, log = true}

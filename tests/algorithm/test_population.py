@@ -15,7 +15,7 @@ from sauna.config.presets import resolve, resolve_run
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
 
-WORLD = "worlds:Scripted"
+ENV = "small_envs:Scripted"
 ARMS = [
     ("sauna-reference", {"threshold": 0.6}),
     pytest.param("ppo", {}, marks=pytest.mark.slow),
@@ -28,12 +28,12 @@ ARMS = [
 @pytest.mark.parametrize("arm, settings", ARMS)
 def test_member_3_alone_among_six_and_in_another_process(arm, settings, tmp_path) -> None:
     common = {"arm": arm, "envs": 2, "steps": 256, **settings}
-    alone = train_here(make_job(WORLD, seeds="3,", **common))
-    among = train_here(make_job(WORLD, seeds=6, **common))
+    alone = train_here(make_job(ENV, seeds="3,", **common))
+    among = train_here(make_job(ENV, seeds=6, **common))
     assert equal(own(alone.final, f"{arm}/3"), own(among.final, f"{arm}/3"))
     assert alone.rows == [row for row in among.rows if row["seed"] == 3]
     elsewhere = sauna.train(
-        WORLD,
+        ENV,
         quiet=True,
         out=tmp_path / "run",
         **{**SMALL, **common, "seeds": "3,4,5", "processes": 2},
@@ -46,7 +46,7 @@ def test_member_3_alone_among_six_and_in_another_process(arm, settings, tmp_path
 
 def test_members_differ() -> None:
     """The negative control: other seeds give other bits."""
-    final = train_here(make_job(WORLD, arm="ppo", seeds=2)).final
+    final = train_here(make_job(ENV, arm="ppo", seeds=2)).final
     assert not np.array_equal(own(final, "ppo/0")["/adam/mean"], own(final, "ppo/1")["/adam/mean"])
 
 
@@ -66,19 +66,19 @@ def test_members_differ() -> None:
 def test_off_means_off(target: str, trunk: str) -> None:
     """Threshold 0 and c2 = 0 are PPO bit for bit, whatever the head would have learned."""
     common = {"envs": 2, "trunk": trunk, "steps": 256}
-    ppo = train_here(make_job(WORLD, arm="ppo", **common))
-    job = make_job(WORLD, arm="sauna", threshold=0.0, vex_coef=0.0, **common)
+    ppo = train_here(make_job(ENV, arm="ppo", **common))
+    job = make_job(ENV, arm="sauna", threshold=0.0, vex_coef=0.0, **common)
     off = train_here(job._replace(config=dataclasses.replace(job.config, vex_target=target)))
     assert equal(own(ppo.final, "ppo/0"), own(off.final, "sauna/0"))
-    on = train_here(make_job(WORLD, arm="sauna", threshold=0.9, vex_target=target, **common))
+    on = train_here(make_job(ENV, arm="sauna", threshold=0.9, vex_target=target, **common))
     assert not equal(own(ppo.final, "ppo/0"), own(on.final, "sauna/0"))
 
 
 def test_off_is_off_for_the_reference_options_too() -> None:
     """With everything kept the released GAE is the usual one, time limits being termination."""
     common = {"envs": 2, "steps": 256, "truncation": "terminate"}
-    ppo = train_here(make_job(WORLD, arm="ppo", **common))
-    off = train_here(make_job(WORLD, arm="sauna-reference", threshold=0.0, vex_coef=0.0, **common))
+    ppo = train_here(make_job(ENV, arm="ppo", **common))
+    off = train_here(make_job(ENV, arm="sauna-reference", threshold=0.0, vex_coef=0.0, **common))
     for name, value in own(ppo.final, "ppo/0").items():
         if name.startswith("/params"):
             np.testing.assert_allclose(own(off.final, "sauna-reference/0")[name], value, atol=1e-5)
@@ -93,11 +93,9 @@ def test_arms_that_differ_in_traced_values_share_a_program() -> None:
 
 def check_arms() -> None:
     common = {"steps": 256, "envs": 2}
-    together = train_here(
-        make_job(WORLD, arm="ppo,vex-head,sauna", seeds=2, threshold=0.9, **common)
-    )
+    together = train_here(make_job(ENV, arm="ppo,vex-head,sauna", seeds=2, threshold=0.9, **common))
     for arm, settings in (("ppo", {}), ("vex-head", {}), ("sauna", {"threshold": 0.9})):
-        alone = train_here(make_job(WORLD, arm=arm, seeds=2, **settings, **common))
+        alone = train_here(make_job(ENV, arm=arm, seeds=2, **settings, **common))
         for seed in (0, 1):
             one, other = own(alone.final, f"{arm}/{seed}"), own(together.final, f"{arm}/{seed}")
             assert equal(one, other), (arm, seed)

@@ -26,7 +26,7 @@ def code_of(settings: dict) -> dict[str, str]:
 
 
 ENVIRONMENT = """
-from worlds import Scripted
+from small_envs import Scripted
 from rewards_of_mine import SCALE
 
 class Mine(Scripted):
@@ -53,7 +53,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_digest_covers_what_a_module_imports_and_no_more(mine: Path) -> None:
     config = {"env": "of_mine:Mine", "network": "mlp"}
     before = code_of(config)
-    assert {"of_mine", "rewards_of_mine", "worlds"} <= set(before)
+    assert {"of_mine", "rewards_of_mine", "small_envs"} <= set(before)
     assert not {"numpy", "gymnasium", "bystander_of_mine", "sauna"} & set(before)
     assert code_of(config) == before and changed_code(before, before) == ""
     (mine / "bystander_of_mine.py").write_text("x = 1\n")

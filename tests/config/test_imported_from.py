@@ -15,7 +15,7 @@ from sauna.system.errors import BadInput
 from sauna.training import run as runs
 from sauna.training.display import PlainDisplay
 
-MODULE = "from worlds import Scripted as Mine\n"
+MODULE = "from small_envs import Scripted as Mine\n"
 
 
 def test_a_run_opened_elsewhere_names_the_folder_and_does_not_import_from_it(

@@ -20,7 +20,7 @@ from sauna.config.plugins import import_name, name_of
 from sauna.config.settings import parse
 from sauna.system import supported
 from sauna.system.errors import BadInput, Interrupted, SaunaError
-from worlds import Finite, Scripted
+from small_envs import Finite, Scripted
 
 SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 64}
 
@@ -70,7 +70,7 @@ def test_a_name_is_never_given_twice_and_importable_things_keep_theirs() -> None
     same = lambda: None  # noqa: E731
     assert name_of(same) != name_of(same)
     assert import_name("env", name_of(same)) is same
-    assert name_of(Scripted) == "worlds:Scripted"
+    assert name_of(Scripted) == "small_envs:Scripted"
 
 
 def test_a_process_without_the_part_says_so(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_process_without_the_part_says_so(tmp_path: Path) -> None:
     sauna.train(lambda: Pays(2.0), quiet=True, out=out, **SETTINGS)
     code = (
         "import sauna, sauna.cli\n"
-        "from worlds import Finite\n"
+        "from small_envs import Finite\n"
         f"try: sauna.cli.main(['eval', {str(out)!r}])\n"
         "except SystemExit as end: print(end.code)\n"
         "class Pays(Finite):\n"

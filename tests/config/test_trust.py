@@ -90,7 +90,7 @@ def test_where_no_key_can_be_kept_this_process_still_knows_its_own(monkeypatch) 
 def test_a_run_of_somebody_elses_runs_nothing(tmp_path: Path, key: Path, monkeypatch) -> None:
     """Started with one key, opened with another; then trusted, and from then on one's own."""
     run = tmp_path / "run"
-    sauna.train("worlds:Scripted", out=run, quiet=True, **{**SMALL, "arm": "ppo"})
+    sauna.train("small_envs:Scripted", out=run, quiet=True, **{**SMALL, "arm": "ppo"})
     shutil.move(run, tmp_path / "moved")
     run = tmp_path / "moved"
     assert sauna.evaluate(run, episodes=1)["members"]
@@ -102,7 +102,7 @@ def test_a_run_of_somebody_elses_runs_nothing(tmp_path: Path, key: Path, monkeyp
             cli.main([command[0], str(run), *command[1:]])
         assert end.value.code == 2
     for call in (sauna.load, sauna.evaluate, sauna.inspect, sauna.resume):
-        with pytest.raises(BadInput, match=r"'worlds:Scripted'; if you trust it, give --trust"):
+        with pytest.raises(BadInput, match=r"'small_envs:Scripted'; if you trust it, give --trust"):
             call(run)
     assert imported == []
     monkeypatch.undo()
@@ -143,7 +143,7 @@ def test_a_studys_file_runs_nothing_before_it_is_trusted(
 
 
 def test_a_study_that_was_run_before_needs_no_trust(tmp_path: Path, key: Path) -> None:
-    text = {"name": "mine", "tasks": ["worlds:Scripted"]}
+    text = {"name": "mine", "tasks": ["small_envs:Scripted"]}
     with pytest.raises(BadInput, match="study 'mine' names code"):
         check_study(text, tmp_path, trust=False)
     (tmp_path / "mine").mkdir()

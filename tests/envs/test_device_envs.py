@@ -27,8 +27,8 @@ from sauna.training.worker import train_members
 slow = pytest.mark.slow
 # An environment of each backend, and how long its episodes may last here.
 BACKENDS = [
-    ("jax_worlds:walk", {}, 12),
-    ("jax_worlds:make_walk", {"limit": 1e9}, 12),
+    ("jax_envs:walk", {}, 12),
+    ("jax_envs:make_walk", {"limit": 1e9}, 12),
     ("gymnax/Pendulum-v1", {"max_steps_in_episode": 7}, 7),
     ("gymnax/Breakout-MinAtar", {"max_steps_in_episode": 7}, 7),
     *(
@@ -133,8 +133,8 @@ def test_the_host_face_is_an_ordinary_environment() -> None:
 
 def test_a_reset_draws_nothing_that_the_actions_draw() -> None:
     """Action noise of step t is drawn with `fold_in(key(seed), t)`; `split` folds in 0, 1, ..."""
-    world = make_env("jax_worlds:walk", {})
-    start = world.reset(seed=7)[0][0]
+    one = make_env("jax_envs:walk", {})
+    start = one.reset(seed=7)[0][0]
     noise = [jax.random.normal(jax.random.fold_in(jax.random.key(7), t)) for t in range(4)]
     assert start not in np.asarray(noise)
     straight = jax.random.normal(jax.random.split(jax.random.key(7))[1])
@@ -160,7 +160,7 @@ def test_unknown_names_and_arguments_are_bad_input() -> None:
     with pytest.raises(BadInput, match="no parameter 'gravty'"):
         make_jax_env("gymnax/CartPole-v1", {"gravty": 3})
     with pytest.raises(BadInput, match="takes none"):
-        make_jax_env("jax_worlds:walk", {"limit": 3})
+        make_jax_env("jax_envs:walk", {"limit": 3})
 
 
 CARTPOLE = {

@@ -47,9 +47,9 @@ def test_single_finite_numbers_are_taken_and_nothing_else() -> None:
 @pytest.mark.parametrize(
     "env, settings",
     [
-        ("worlds:Informative", {"arm": "sauna"}),
-        ("worlds:Informative", {"arm": "ppo", "envs": 2, "env_processes": 2}),
-        ("jax_worlds:informative", {"arm": "ppo", "backend": "device", "device": "cpu", "envs": 2}),
+        ("small_envs:Informative", {"arm": "sauna"}),
+        ("small_envs:Informative", {"arm": "ppo", "envs": 2, "env_processes": 2}),
+        ("jax_envs:informative", {"arm": "ppo", "backend": "device", "device": "cpu", "envs": 2}),
     ],
 )
 def test_rows_hold_the_means_over_the_episodes_that_ended(env: str, settings: dict) -> None:
@@ -66,5 +66,5 @@ def test_rows_hold_the_means_over_the_episodes_that_ended(env: str, settings: di
 
 
 def test_rows_without_numbers_of_info_are_as_before() -> None:
-    rows = train_here(make_job("worlds:Scripted", arm="ppo")).rows
+    rows = train_here(make_job("small_envs:Scripted", arm="ppo")).rows
     assert not [name for row in rows for name in row if "info" in name or "success" in name]

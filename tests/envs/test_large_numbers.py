@@ -13,7 +13,7 @@ import sauna
 from helpers import SMALL
 from sauna.algorithm.rollout.device import _finite_rows
 from sauna.envs.host.gymnasium_envs import LARGEST, EnvironmentFailure, GymnasiumEnvs
-from worlds import Scripted
+from small_envs import Scripted
 
 
 class Large(Scripted):

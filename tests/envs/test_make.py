@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sauna
-import worlds
+import small_envs
 from helpers import SMALL, environment
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.mujoco_envs import MujocoEnvs
@@ -53,9 +53,9 @@ def test_ids_that_only_look_like_a_games_are_left_alone() -> None:
 
 
 OWN = """
-import gymnasium, worlds
-gymnasium.register("OwnScripted-v3", entry_point="worlds:Scripted")
-class Mine(worlds.Scripted):
+import gymnasium, small_envs
+gymnasium.register("OwnScripted-v3", entry_point="small_envs:Scripted")
+class Mine(small_envs.Scripted):
     pass
 """
 
@@ -95,9 +95,9 @@ def test_modules_of_the_working_directory(name: str, words: str | None, tmp_path
 @pytest.mark.parametrize(
     "env, words",
     [
-        ("worlds:INSTANCE", "is an environment already; give what makes one"),
-        ("worlds:make_vector", "gives a vector of environments; .* as envs"),
-        ("worlds:itertools", "is a module, and makes no environment"),
+        ("small_envs:INSTANCE", "is an environment already; give what makes one"),
+        ("small_envs:make_vector", "gives a vector of environments; .* as envs"),
+        ("small_envs:itertools", "is a module, and makes no environment"),
     ],
 )
 def test_what_makes_no_single_environment_is_refused_with_what_to_write(env, words) -> None:
@@ -107,7 +107,7 @@ def test_what_makes_no_single_environment_is_refused_with_what_to_write(env, wor
 
 def test_values_that_make_no_single_environment_are_refused(tmp_path: Path) -> None:
     for value, words in (
-        (worlds.Scripted(), "what was passed is an environment already"),
+        (small_envs.Scripted(), "what was passed is an environment already"),
         (gymnasium.make("CartPole-v1"), "what was passed is an environment already"),
         (gymnasium.make_vec("CartPole-v1", num_envs=2), "is an environment already"),
         (lambda: gymnasium.make_vec("CartPole-v1", num_envs=2), "gives a vector"),
@@ -135,7 +135,7 @@ def test_an_id_that_this_program_registered_trains_in_it(tmp_path: Path) -> None
 
 
 def test_render_mode_among_the_arguments_gives_way() -> None:
-    made = make_env("worlds:Never", {"render_mode": "human"}, render_mode="rgb_array")
+    made = make_env("small_envs:Never", {"render_mode": "human"}, render_mode="rgb_array")
     assert made.render_mode == "rgb_array"
     made = make_env("CartPole-v1", {"render_mode": None}, render_mode="rgb_array")
     assert made.unwrapped.render_mode == "rgb_array"
@@ -158,7 +158,7 @@ def test_a_close_that_raises_does_not_lose_a_training(tmp_path: Path) -> None:
     for processes in (0, 1):
         out = tmp_path / f"run{processes}"
         settings = {**SMALL, "processes": 1, "env_processes": processes}
-        run = sauna.train("worlds:Unclosable", quiet=True, out=out, **settings)
+        run = sauna.train("small_envs:Unclosable", quiet=True, out=out, **settings)
         assert run_directory.is_complete(run.path)
         assert sum(row["env_steps"] for row in run.metrics) >= 96
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces as gym
 
-import worlds
-from jax_worlds import choosy
+import small_envs
+from jax_envs import choosy
 from sauna.envs.device.as_gymnasium import HostFace
 from sauna.envs.device.contract import flat
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
@@ -70,14 +70,14 @@ def test_the_mask_stands_behind_the_numbers_and_before_pictures() -> None:
 @pytest.mark.parametrize("by", ["info", "method"])
 def test_each_step_shows_the_mask_that_the_environment_gives(several: bool, by: str) -> None:
     kwargs = {"several": several, "by": by}
-    envs = in_process_envs("worlds:Choosy", kwargs, [(0, 0)], "auto", wrapping=MASKED)
+    envs = in_process_envs("small_envs:Choosy", kwargs, [(0, 0)], "auto", wrapping=MASKED)
     seen, action = envs.reset(), np.zeros((1, 1 + several), np.int32)
-    world = envs._slots[0].env
+    inner = envs._slots[0].env
     for _ in range(8):  # over an end of an episode
-        np.testing.assert_array_equal(seen[0, 3:], world.valid)
-        action[0, 0] = np.flatnonzero(world.valid[: 3 if several else 5])[0]
+        np.testing.assert_array_equal(seen[0, 3:], inner.valid)
+        action[0, 0] = np.flatnonzero(inner.valid[: 3 if several else 5])[0]
         if several:
-            action[0, 1] = np.flatnonzero(world.valid[3:])[0]
+            action[0, 1] = np.flatnonzero(inner.valid[3:])[0]
         step = envs.step(action.copy(), np.ones(1, bool))
         seen = step.observation
         if step.ended:
@@ -89,7 +89,7 @@ def test_each_step_shows_the_mask_that_the_environment_gives(several: bool, by: 
 def test_a_missing_or_empty_mask_is_an_error_that_names_the_environment() -> None:
     for wrong, words in (("missing", "gives none"), ("empty", "leaves no valid action")):
         kwargs = {"wrong": wrong}
-        envs = in_process_envs("worlds:Choosy", kwargs, [(4, 1)], "auto", wrapping=MASKED)
+        envs = in_process_envs("small_envs:Choosy", kwargs, [(4, 1)], "auto", wrapping=MASKED)
         seen = envs.reset()
         with pytest.raises(EnvironmentFailure, match=f"environment 1 of seed 4.*{words}"):
             for _ in range(3):
@@ -99,16 +99,16 @@ def test_a_missing_or_empty_mask_is_an_error_that_names_the_environment() -> Non
 
 def test_what_gives_no_mask_or_takes_none_is_refused_at_the_start() -> None:
     for env, words in (
-        ("worlds:TwoSteps", "the environment gives none"),
-        ("worlds:Scripted", "needs Discrete or MultiDiscrete actions"),
+        ("small_envs:TwoSteps", "the environment gives none"),
+        ("small_envs:Scripted", "needs Discrete or MultiDiscrete actions"),
     ):
         with pytest.raises(BadInput, match=f"^action_mask: .*{words}"):
             probe(env, {}, MASKED)
     with pytest.raises(BadInput, match="needs Discrete or MultiDiscrete"):
-        probe_on_device("jax_worlds:walk", {}, MASKED)
-    assert probe("worlds:Choosy", {"several": True}, MASKED).differs is None
-    with pytest.raises(BadInput, match="is not valid"):  # the world would raise without its mask
-        probe("worlds:Choosy", {"several": True})
+        probe_on_device("jax_envs:walk", {}, MASKED)
+    assert probe("small_envs:Choosy", {"several": True}, MASKED).differs is None
+    with pytest.raises(BadInput, match="is not valid"):  # it would raise without its mask
+        probe("small_envs:Choosy", {"several": True})
 
 
 def test_rows_that_are_stepped_together_take_no_masks() -> None:
@@ -125,14 +125,14 @@ def test_a_picture_of_floats_beside_a_mask_is_refused() -> None:
 def test_a_wrapped_environment_is_found_through_its_wrappers() -> None:
     import gymnasium
 
-    env = make_env("worlds:Choosy", {"by": "method"})
+    env = make_env("small_envs:Choosy", {"by": "method"})
     wrapped = gymnasium.wrappers.TimeLimit(env, 5)
     from sauna.envs.masked import MaskedEnv
 
     masked = MaskedEnv(wrapped)
     seen, _ = masked.reset(seed=0)
     np.testing.assert_array_equal(seen["action_mask"], env.valid)
-    assert masked.unwrapped is env and isinstance(env, worlds.Choosy)
+    assert masked.unwrapped is env and isinstance(env, small_envs.Choosy)
 
 
 def test_the_device_shows_the_same_mask_as_its_gymnasium_interface() -> None:
@@ -152,4 +152,4 @@ def test_an_environment_that_raises_at_invalid_actions_gets_a_hint() -> None:
     with pytest.raises(
         BadInput, match=r"is not valid.*; it has action_masks\(\): give --action-mask"
     ):
-        probe("worlds:Choosy", {"by": "method"})
+        probe("small_envs:Choosy", {"by": "method"})

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces as gym
 
-import worlds
-from jax_worlds import walk
+import small_envs
+from jax_envs import walk
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.probe import probe, probe_on_device
 from sauna.envs.shapes import batch_size, check_shapes, one_of
@@ -78,7 +78,7 @@ def test_the_key_of_the_part_is_named() -> None:
         observation_reader(gym.Box(0, 1, (2, 3)))(np.zeros((3, 2)))
 
 
-class Tall(worlds.Parts):
+class Tall(small_envs.Parts):
     """Its speed has a leading axis from step `since` on."""
 
     since = 0
@@ -94,9 +94,9 @@ class TallLater(Tall):
 
 def test_a_leading_axis_never_trains_silently(monkeypatch: pytest.MonkeyPatch) -> None:
     said = r"observation\['speed'\] is of shape \(1, 2\), and its space of \(2,\)"
-    monkeypatch.setattr(worlds, "Tall", Tall, raising=False)
+    monkeypatch.setattr(small_envs, "Tall", Tall, raising=False)
     with pytest.raises(BadInput, match=said):
-        probe("worlds:Tall", {})
+        probe("small_envs:Tall", {})
     envs = GymnasiumEnvs(TallLater, [(0, 0)])
     envs.reset()
     action, all_ = (
@@ -111,6 +111,6 @@ def test_a_leading_axis_never_trains_silently(monkeypatch: pytest.MonkeyPatch) -
 def test_on_the_device_another_shape_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would be flattened without a word."""
     tall = walk._replace(observation_space=gym.Box(-1, 1, (*walk.observation_space.shape, 1)))
-    monkeypatch.setattr(worlds, "tall_walk", tall, raising=False)
+    monkeypatch.setattr(small_envs, "tall_walk", tall, raising=False)
     with pytest.raises(BadInput, match="observation is of shape"):
-        probe_on_device("worlds:tall_walk", {})
+        probe_on_device("small_envs:tall_walk", {})

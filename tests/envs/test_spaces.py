@@ -67,7 +67,7 @@ def test_what_is_no_space_is_refused(values: list) -> None:
 
 def test_a_run_resumes_under_other_print_options_and_a_run_of_before_too(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    sauna.train("worlds:Scripted", out=run, quiet=True, checkpoint_every=2, **SMALL)
+    sauna.train("small_envs:Scripted", out=run, quiet=True, checkpoint_every=2, **SMALL)
     (run / "summary.json").unlink()
     kept = run_directory.read_config(run)
     before = ["Box(-inf, inf, (3,), float64)", "Box(-1.0, 1.0, (2,), float32)"]

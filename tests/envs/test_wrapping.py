@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-import jax_worlds
+import jax_envs
 import sauna
 import wrappers
 from helpers import equal, make_job, resumed, train_here
@@ -21,7 +21,7 @@ from sauna.envs.masked import MaskedEnv
 from sauna.envs.stacked import StackedEnv, StackedSpace
 from sauna.envs.wrapping import Wrapping, read_wrapping
 from sauna.system.errors import BadInput
-from worlds import Finite
+from small_envs import Finite
 
 ORDERED = ("wrappers:Double", "wrappers:plus_one")
 
@@ -32,7 +32,7 @@ def test_the_last_observations_are_one_also_at_both_ends_of_an_episode() -> None
         assert env.reset(seed=1)[0].tolist() == [0, 0, 0]
         seen = [env.step(0)[0].tolist() for _ in range(5)]
         assert seen == [[0, 0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]]
-    envs = in_process_envs("worlds:Finite", {}, [(0, 0)], "auto", wrapping=Wrapping(stack=2))
+    envs = in_process_envs("small_envs:Finite", {}, [(0, 0)], "auto", wrapping=Wrapping(stack=2))
     envs.reset()
     for _ in range(5):
         step = envs.step(np.zeros((1, 1), np.int32), np.ones(1, bool))
@@ -46,7 +46,7 @@ def test_wrapped_environments_can_be_copied() -> None:
 
 
 def test_the_device_stacks_as_the_host_does() -> None:
-    one = jax_worlds.walk
+    one = jax_envs.walk
     ours, theirs = stacked(one, 3), StackedEnv(HostFace(one), 3)
     assert isinstance(ours.observation_space, StackedSpace)
     assert ours.observation_space == theirs.observation_space and stacked(one, 1) is one
@@ -64,7 +64,7 @@ def test_the_device_stacks_as_the_host_does() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["host", "device"])
 def test_stacked_observations_train_are_evaluated_and_resume_exactly(place: str) -> None:
-    env = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}[place]
+    env = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}[place]
     job = make_job(env, arm="ppo", stack=3, eval_every=64, eval_episodes=1)
     width = make_job(env, arm="ppo").spaces.observation_shape[0]
     assert job.spaces.observation_shape == (3 * width,)
@@ -78,7 +78,7 @@ def test_stacked_observations_train_are_evaluated_and_resume_exactly(place: str)
 def test_a_policy_makes_the_environment_that_it_was_trained_on(tmp_path) -> None:
     settings = {"steps": 64, "rollout_steps": 32, "minibatches": 4, "hidden": "4"}
     env = {"stack": 2, "wrap": [wrappers.Double], "out": tmp_path / "run"}
-    policy = sauna.train("worlds:TwoSteps", arm="ppo", quiet=True, **settings, **env).policy()
+    policy = sauna.train("small_envs:TwoSteps", arm="ppo", quiet=True, **settings, **env).policy()
     made = policy.make_env()
     seen, _ = made.reset(seed=0)
     assert seen.tolist() == [0, 0] and policy(seen) in (0, 1)
@@ -88,13 +88,13 @@ def test_a_policy_makes_the_environment_that_it_was_trained_on(tmp_path) -> None
 
 def test_pictures_are_not_stacked() -> None:
     with pytest.raises(BadInput, match="stack: pictures are not stacked"):
-        make_job("worlds:Picture", arm="ppo", stack=2, network="auto")
+        make_job("small_envs:Picture", arm="ppo", stack=2, network="auto")
 
 
 def test_a_users_wrappers_go_around_every_environment_in_their_order() -> None:
     """Twice the reward, and one more; in training and in evaluations."""
     job = make_job(
-        "worlds:TwoSteps",
+        "small_envs:TwoSteps",
         arm="ppo",
         normalize_rewards="no",
         wrap=",".join(ORDERED),
@@ -117,16 +117,16 @@ REFUSED = [
     ({"wrap": "wrappers:Dubble"}, "wrap: module 'wrappers' has no 'Dubble'.*Double"),
     ({"wrap": "wrappers"}, "wrap: 'wrappers' is no module:function"),
     ({"wrap": "sauna.config.local:f_0"}, "wrap: a wrapper has to be importable"),
-    ({"env": "jax_worlds:walk", "wrap": ORDERED[0]}, "wrap: not read by arm ppo; .* on the host"),
-    ({"env": "vector_worlds:same", "wrap": ORDERED[0]}, "wrap: the rows of vector_worlds:same are"),
-    ({"env": "vector_worlds:Agents", "stack": 2}, "stack: the rows of vector_worlds:Agents are"),
+    ({"env": "jax_envs:walk", "wrap": ORDERED[0]}, "wrap: not read by arm ppo; .* on the host"),
+    ({"env": "vector_envs:same", "wrap": ORDERED[0]}, "wrap: the rows of vector_envs:same are"),
+    ({"env": "vector_envs:Agents", "stack": 2}, "stack: the rows of vector_envs:Agents are"),
 ]
 
 
 @pytest.mark.parametrize("settings, words", REFUSED, ids=[str(r[0]) for r in REFUSED])
 def test_a_wrapper_that_cannot_be_used_is_refused_in_a_line(settings: dict, words: str) -> None:
     with pytest.raises(BadInput, match=words) as error:
-        make_job(**{"env": "worlds:TwoSteps", "arm": "ppo", **settings})
+        make_job(**{"env": "small_envs:TwoSteps", "arm": "ppo", **settings})
     assert "\n" not in str(error.value)
 
 
@@ -136,6 +136,6 @@ def test_wrappers_that_somebody_else_named_need_trust() -> None:
 
 
 def test_the_plain_form_of_an_environment_is_wrapped_too() -> None:
-    env = make_env("worlds:TwoSteps", {}, Wrapping(ORDERED, stack=2))
+    env = make_env("small_envs:TwoSteps", {}, Wrapping(ORDERED, stack=2))
     assert env.reset(seed=0)[0].tolist() == [0, 0]
     assert env.step(0)[:2][1] == 1.0 and env.unwrapped.__class__.__name__ == "TwoSteps"

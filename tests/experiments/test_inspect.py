@@ -46,7 +46,7 @@ from sauna.experiments.inspect.recording import (
 from sauna.experiments.inspect.streams import scaled, stream_of
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
-from worlds import Drawn, Lives, Scripted
+from small_envs import Drawn, Lives, Scripted
 
 THRESHOLD = 0.9
 
@@ -62,7 +62,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "rollout_steps": 16,
         "processes": 1,
     }
-    return sauna.train("worlds:Drawn", quiet=True, out=path, **settings).path
+    return sauna.train("small_envs:Drawn", quiet=True, out=path, **settings).path
 
 
 def examined(run: Path, name: str = "sauna/0", **changes: Any) -> Inspection:
@@ -340,7 +340,7 @@ def test_agents_are_refused_before_anything_is_said_of_frames() -> None:
     said: list[str] = []
     for frames in (True, False):
         with pytest.raises(BadInput, match="a page shows one agent"):
-            open_env("vector_worlds:Agents", {}, PLAIN, frames, said.append)
+            open_env("vector_envs:Agents", {}, PLAIN, frames, said.append)
     assert said == []
 
 
@@ -360,7 +360,10 @@ def test_bad_input_creates_nothing(run, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_runs_of_the_device_and_of_pictures_are_inspected(tmp_path) -> None:
-    for env, more in (("gymnax/CartPole-v1", {}), ("worlds:Picture", {"network": "nature-cnn"})):
+    for env, more in (
+        ("gymnax/CartPole-v1", {}),
+        ("small_envs:Picture", {"network": "nature-cnn"}),
+    ):
         settings = {**SMALL, "preset": "mujoco", "arm": "sauna", **more}
         settings["out"] = tmp_path / env.replace("/", "-")
         if more:

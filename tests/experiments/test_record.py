@@ -20,7 +20,7 @@ SETTINGS = {**SMALL, "processes": 1, "arm": "ppo", "steps": 64, "seeds": 2}
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("recorded") / "run"
-    sauna.train("worlds:Endless", quiet=True, out=path, **SETTINGS)
+    sauna.train("small_envs:Endless", quiet=True, out=path, **SETTINGS)
     return path
 
 
@@ -57,7 +57,7 @@ def test_each_observation_is_the_one_before_its_action(run, kept) -> None:
     from sauna.envs.make import make_env
 
     sauna.record(run, "a.parquet", episodes=1, say=lambda text: None, max_steps=20)
-    env = make_env("worlds:Endless", {})
+    env = make_env("small_envs:Endless", {})
     seen = [env.reset(seed=0)[0]]
     seen += [env.step(action)[0] for action in kept[0].action]
     np.testing.assert_array_equal(kept[0].observation, np.stack(seen))
@@ -68,7 +68,7 @@ def test_what_cannot_be_recorded_is_refused(run, tmp_path) -> None:
         ("a.csv", {}, "neither minari:NAME nor a file that ends in .parquet"),
         ("a.parquet", {"episodes": 0}, "episodes: must be at least 1"),
         ("a.parquet", {"member": "ppo/7"}, "unknown member 'ppo/7'"),
-        ("a.parquet", {"env": "worlds:Scripted"}, "has other spaces than the run"),
+        ("a.parquet", {"env": "small_envs:Scripted"}, "has other spaces than the run"),
     ):
         with pytest.raises(BadInput, match=message):
             sauna.record(run, tmp_path / to, **more)

@@ -22,17 +22,17 @@ from sauna.system import checkpoint, run_directory
 from sauna.system.processes import Shared, Worker, receive, send, start_thread
 from sauna.training.worker import PipeReporter
 
-WORLD = "worlds:Scripted"
-BACKENDS = {"host": WORLD, "device": "jax_worlds:walk"}
+ENV = "small_envs:Scripted"
+BACKENDS = {"host": ENV, "device": "jax_envs:walk"}
 SETTINGS = {**SMALL, "arm": "ppo", "steps": 192, "processes": 1}
 SAVED = {"checkpoint_every": 2, "keep_checkpoints": 2}
 ITERATIONS = 6
 
 
 @cache
-def record(world: str = WORLD) -> Recorder:
+def record(env: str = ENV) -> Recorder:
     """Rows of every iteration and the state at the start of each."""
-    return train_here(make_job(world, **SETTINGS, checkpoint_every=1))
+    return train_here(make_job(env, **SETTINGS, checkpoint_every=1))
 
 
 def serve(recorder: Recorder, inbox: Connection, outlet: Connection) -> None:
@@ -76,12 +76,12 @@ def played_back(recorder: Recorder) -> Iterator[None]:
         yield
 
 
-def go(run: Path, world: str = WORLD) -> None:
+def go(run: Path, env: str = ENV) -> None:
     """Starts the run, or continues it where it is."""
     if (run / "config.json").exists():
         sauna.resume(run, quiet=True)
     else:
-        sauna.train(world, out=run, quiet=True, **SAVED, **SETTINGS)
+        sauna.train(env, out=run, quiet=True, **SAVED, **SETTINGS)
 
 
 class Trap:
@@ -104,12 +104,12 @@ class Trap:
             self.saved.add(op.data)
 
 
-def until(run: Path, hook: Hook, world: str = WORLD) -> BaseException | None:
+def until(run: Path, hook: Hook, env: str = ENV) -> BaseException | None:
     """Lets the run go on with `hook` at every file operation; how it ended."""
     run.mkdir(parents=True, exist_ok=True)
     try:
         with watched(run, hook):
-            go(run, world)
+            go(run, env)
     except (Crash, KeyboardInterrupt, Exception) as error:
         return error
     return None

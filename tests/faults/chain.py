@@ -28,8 +28,8 @@ SETTINGS = {
 }
 # Where a run's environments are stepped: the environment, and what else differs.
 BACKENDS: dict[str, tuple[str, dict[str, object]]] = {
-    "host": ("worlds:Scripted", {}),
-    "device": ("jax_worlds:walk", {"checkpoint-every": 5}),  # several iterations per call
+    "host": ("small_envs:Scripted", {}),
+    "device": ("jax_envs:walk", {"checkpoint-every": 5}),  # several iterations per call
 }
 PATIENCE = 180.0  # seconds after which a process that should have ended counts as hung
 Start = Callable[[list[str], Path], Process]

@@ -25,7 +25,7 @@ def main() -> None:
 
     GOLDEN.mkdir(exist_ok=True)
     os.chdir(GOLDEN)
-    for backend, world in BACKENDS.items():
+    for backend, env in BACKENDS.items():
         run = Path(f"format-{FORMAT}-{backend}")
         if run.exists():
             continue
@@ -34,7 +34,7 @@ def main() -> None:
             patch("sauna.system.run_directory.machine", dict),
         ):
             sauna.train(
-                world, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=3, **SETTINGS
+                env, out=run, quiet=True, checkpoint_every=2, keep_checkpoints=3, **SETTINGS
             )
         for path in (run / "summary.json", run / ".lock"):
             path.unlink()

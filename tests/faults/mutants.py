@@ -30,7 +30,7 @@ QUICK = (
     "samples",
     "ppo",
     "selected",
-    "rules",
+    "algorithm/selection/test_rules",
     "loss_rules",
     "control",
     "draws",
@@ -41,7 +41,11 @@ QUICK = (
     "reference",
     "properties",
 )
-SLOW = ("probes", "population")  # for what the others let pass
+SLOW = ("probes", "algorithm/test_population")  # for what the others let pass
+CHEAP_COMPILING = {  # as `make test` does
+    "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+}
 
 
 class Mutant(NamedTuple):
@@ -276,8 +280,8 @@ MUTANTS = [
         ),
         (
             "acts without noise",
-            "policy.apply(params, observation), noise)",
-            "policy.apply(params, observation), 0.0 * noise)",
+            "policy.sample(params, output, noise)\n    return action",
+            "policy.sample(params, output, 0.0 * noise)\n    return action",
         ),
     ),
     *_of(
@@ -309,6 +313,11 @@ MUTANTS = [
         "algorithm/policy/convolutions.py",
         "networks",
         ("pixels not scaled", "beside.astype(jnp.float32) / 255.0", "beside.astype(jnp.float32)"),
+        (
+            "pixels not scaled without a gradient",
+            "x = x.astype(jnp.float32) / 255.0",
+            "x = x.astype(jnp.float32)",
+        ),
         ("kernel upside down", "@ rows[i] for i", "@ rows[-1 - i] for i"),
         (
             "columns and rows of a block swapped",
@@ -384,35 +393,35 @@ MUTANTS = [
     ),
     *_of(
         "algorithm/selection/gigaflow.py",
-        "rules",
+        "algorithm/selection/test_rules",
         ("other running rate", "rate: float = 0.25", "rate: float = 0.75"),
         ("threshold of today's largest", ">= threshold * largest", ">= threshold * now"),
     ),
     *_of(
         "algorithm/selection/top_advantage.py",
-        "rules",
+        "algorithm/selection/test_rules",
         ("sign of the advantage counts", "jnp.abs(samples.advantage)", "samples.advantage"),
     ),
     *_of(
         "algorithm/selection/prioritized.py",
-        "rules",
+        "algorithm/selection/test_rules",
         ("corrected the other way", "** -b, 0.0)", "** b, 0.0)"),
         ("correction does not rise", "(1.0 - correction) * progress", "0.0 * progress"),
     ),
     *_of(
         "algorithm/selection/gradient_norm.py",
-        "rules",
+        "algorithm/selection/test_rules",
         ("weights of all slots", "_inverse(number * p)", "_inverse(len(p) * p)"),
         ("biases forgotten", "jnp.sum(hidden**2, -1) + 1.0", "jnp.sum(hidden**2, -1)"),
     ),
     *_of(
         "algorithm/selection/pods.py",
-        "rules",
+        "algorithm/selection/test_rules",
         ("last segment cut off", "pieces = -(-steps // length)", "pieces = steps // length"),
     ),
     *_of(
         "algorithm/selection/scores.py",
-        "rules control",
+        "algorithm/selection/test_rules control",
         (
             "one row too many",
             "found = jax.lax.top_k(jnp.where(eligible, score, -jnp.inf), count)",
@@ -547,7 +556,7 @@ def main() -> int:
     parser.add_argument("--only", default="")
     given = parser.parse_args()
     chosen = [m for m in MUTANTS if given.only in f"{m.file}: {m.name}"]
-    os.environ.update(JAX_PLATFORMS="cpu", PJRT_NPROC="1", OMP_NUM_THREADS="1")
+    os.environ.update(JAX_PLATFORMS="cpu", PJRT_NPROC="1", OMP_NUM_THREADS="1", **CHEAP_COMPILING)
     _import_libraries()
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / "src"
@@ -653,7 +662,9 @@ def _test(copy: Path, tests: tuple[str, ...], log: Path) -> None:
     files = [str(_test_file(t)) for t in tests]
     code = 1
     try:
-        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=short", *files]))
+        quiet = ["-x", "-q", "-p", "no:cacheprovider", "--tb=short", "-m", "not slow"]
+        code = int(pytest.main([*quiet, *files]))
+        code = 0 if code == pytest.ExitCode.NO_TESTS_COLLECTED else code
     finally:
         sys.stdout.flush()
         os._exit(code)
@@ -663,7 +674,8 @@ def _test_file(name: str) -> Path:
     """`faults/test_07_poisoned_batch`, or a module's name anywhere below `tests/`."""
     if "/" in name:
         return ROOT / "tests" / f"{name}.py"
-    return next((ROOT / "tests").rglob(f"test_{name}.py"))
+    (path,) = (ROOT / "tests").rglob(f"test_{name}.py")
+    return path
 
 
 def _same_examples_each_time() -> None:

@@ -138,13 +138,13 @@ def _warm() -> None:
     import rich.console
     import scipy.stats
 
-    import jax_worlds
+    import jax_envs
     import sauna.experiments.evaluate.episodes
     import sauna.training.coordinator
     import sauna.training.loop.device
     import sauna.training.loop.host
     import sauna.training.run
-    import worlds
+    import small_envs
     from sauna.algorithm.rollout import moments
 
     numbers = moments.ObservationMoments(1, 1, 1.0)  # loads the compiled loops
@@ -154,7 +154,7 @@ def _warm() -> None:
     numbers.see(one, np.ones((1, 1), bool))
     numbers.see_and_normalize(one, np.ones((1, 1), bool), np.zeros((1, 1, 1), np.float32))
     numbers.normalize(one, np.zeros((1, 1, 1), np.float32))
-    del jax_worlds, matplotlib, rich, scipy, sauna, worlds
+    del jax_envs, matplotlib, rich, scipy, sauna, small_envs
 
 
 class _ForkedWorker:

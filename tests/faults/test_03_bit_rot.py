@@ -16,9 +16,9 @@ from sauna.system import checkpoint
 OLD, NEW = 3, 4
 
 
-def _save_two(folder: Path, world: str) -> dict[int, dict[str, np.ndarray]]:
+def _save_two(folder: Path, env: str) -> dict[int, dict[str, np.ndarray]]:
     """Two checkpoints of a real training."""
-    states = record(world).states
+    states = record(env).states
     for iteration in (OLD, NEW):
         manifest = {
             "config": {"gamma": 0.99, "adam_epsilon": 1e-5},

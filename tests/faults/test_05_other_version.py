@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import BACKENDS, WORLD, Trap, played_back, record, until
+from faults.canned import BACKENDS, ENV, Trap, played_back, record, until
 from faults.disk import tree_of
 from faults.make_golden import GOLDEN
 from faults.result import Result, Tally, assert_held
@@ -39,6 +39,7 @@ OTHERS = {
     "drop_rate": 0.25,
     "stop_at": 2.0,
     "init_from": "runs/another",
+    "wrap": ["wrappers:plus_one"],
 }
 
 
@@ -56,9 +57,9 @@ def experiment(least: int, seed: int, place: Path) -> Result:
 def _change_everything(
     backend: str, least: int, rng: random.Random, place: Path, tally: Tally
 ) -> None:
-    whole, world = place / backend, BACKENDS[backend]
-    with played_back(record(world)):
-        until(whole, Trap(), world)
+    whole, env = place / backend, BACKENDS[backend]
+    with played_back(record(env)):
+        until(whole, Trap(), env)
         (whole / "summary.json").unlink()
         names = [name for name in FIELDS if name not in (*fields_with("resumable"), "out")]
         for name in names if least >= 40 else rng.sample(names, least - 3):
@@ -75,14 +76,16 @@ def _change_setting(whole: Path, run: Path, name: str, tally: Tally) -> None:
     before = stored["config"][name]
     stored["config"][name] = _other(name, before)
     path.write_text(json.dumps(stored))
-    # The environment cannot be made with them; the sequences do not fill the minibatches.
-    refuser = {"env_kwargs": "env", "recurrent": "minibatches"}.get(name, name)
+    # The environment cannot be made with them; the sequences do not fill the minibatches; stacked
+    # observations are other ones.
+    refusers = {"env_kwargs": "env", "recurrent": "minibatches", "stack": "observation"}
+    refuser = refusers.get(name, name)
     _expect_refusal(run, refuser, f"setting {name}", tally)
 
 
 def _other(name: str, value: Any) -> Any:
     if name == "env":
-        return {"worlds:Scripted": "worlds:Forgetful"}.get(value, "jax_worlds:broken")
+        return {"small_envs:Scripted": "small_envs:Forgetful"}.get(value, "jax_envs:broken")
     if name.endswith("_kwargs"):
         return {"speed": 2}
     if name in OTHERS:
@@ -188,7 +191,7 @@ def test_runs_of_every_format_there_was_can_be_used(golden: Path, tmp_path: Path
     assert (
         sauna.load(run, trust=True)(np.zeros(spaces.observation_shape)).shape == spaces.action_sizes
     )
-    with trained_here():  # our worlds may have changed since
+    with trained_here():  # our environments may have changed since
         sauna.resume(run, trust=True, accept_changed_code=True)
     assert run_directory.is_complete(run)
     kept = loaded.checkpoint.manifest["logs"]["metrics.jsonl"]
@@ -215,7 +218,7 @@ def test_an_old_run_ends_alike_under_other_presets(tmp_path: Path, monkeypatch) 
 def test_a_run_of_0_1_0_that_repeats_drop_rates_is_played_and_not_resumed(tmp_path: Path) -> None:
     """One of today's, stored as 0.1.0 stored it."""
     run, settings = tmp_path / "run", {"arm": "random-drop", "drop_rate": 0.4, "vex_coef": 0.1}
-    sauna.train(WORLD, quiet=True, out=run, **SMALL, **settings)
+    sauna.train(ENV, quiet=True, out=run, **SMALL, **settings)
     former = {"drop_rate": 0.0, "drop_rate_from": "elsewhere"}
     stored = run_directory.read_config(run)
     stored["config"] |= former

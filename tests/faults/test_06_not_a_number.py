@@ -17,7 +17,7 @@ import pytest
 import sauna
 from faults.result import Result, Tally, assert_held
 from helpers import SMALL, make_job, train_here
-from jax_worlds import FIELDS, Poison, poisoned
+from jax_envs import FIELDS, Poison, poisoned
 from sauna.algorithm.rollout.device import Faults, collect
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.program import make_program
@@ -44,8 +44,8 @@ from threads import trained_here
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 VALUES = ("nan", "inf", "-inf")
 BACKENDS = {
-    "in-process": lambda kwargs: GymnasiumEnvs(env_maker("worlds:Poisoned", kwargs), SEEDS),
-    "workers": lambda kwargs: ProcessEnvs("worlds:Poisoned", kwargs, SEEDS, 2, timeout=60.0),
+    "in-process": lambda kwargs: GymnasiumEnvs(env_maker("small_envs:Poisoned", kwargs), SEEDS),
+    "workers": lambda kwargs: ProcessEnvs("small_envs:Poisoned", kwargs, SEEDS, 2, timeout=60.0),
 }
 
 
@@ -135,7 +135,7 @@ def _check_message(message: str, kwargs: dict[str, Any], what: str, tally: Tally
 
 def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
     """Inside of a rollout: the moments that normalise must not have seen it."""
-    job = make_job("worlds:Scripted", arm="ppo", envs=3, rollout_steps=64, steps=192)
+    job = make_job("small_envs:Scripted", arm="ppo", envs=3, rollout_steps=64, steps=192)
     envs = BACKENDS["in-process"](kwargs)
     program, key = make_program(job.config, job.spaces), member_keys(0)
     collector = HostCollector(program, job.spaces, envs, [key])
@@ -158,7 +158,7 @@ def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
 
 ENVS = 3  # on the device
 ROLLOUT = 32
-LENGTH = 4  # of an episode of `jax_worlds.poisoned`
+LENGTH = 4  # of an episode of `jax_envs.poisoned`
 
 
 class OnDevice:
@@ -166,7 +166,7 @@ class OnDevice:
 
     def __init__(self) -> None:
         steps = 3 * ROLLOUT * ENVS
-        plain = make_job("worlds:Scripted", arm="ppo", envs=ENVS, steps=steps)
+        plain = make_job("small_envs:Scripted", arm="ppo", envs=ENVS, steps=steps)
         spaces = plain.spaces._replace(action_sizes=(1,))
         config, self._member = plain.config, plain.members[0]
         self._setting = _setting(self._member)
@@ -247,7 +247,7 @@ def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
     wanted = r"environment 0 of seed 0, episode \d+.*reward is nan"
     with trained_here(), pytest.raises(SaunaError, match=wanted):
         sauna.train(
-            "worlds:Poisoned",
+            "small_envs:Poisoned",
             env_kwargs=kwargs,
             out=run,
             quiet=True,
@@ -262,7 +262,7 @@ def test_the_run_stops_and_what_was_saved_stays(tmp_path: Path) -> None:
 
 def test_a_recorded_training_that_fails_has_reported_nothing_of_the_iteration() -> None:
     job = make_job(
-        "worlds:Poisoned",
+        "small_envs:Poisoned",
         arm="ppo",
         steps=3200,
         checkpoint_every=1,

@@ -33,7 +33,7 @@ class _Learner:
     """One compiled update of a small network, with a good batch to spoil."""
 
     def __init__(self, **settings: int) -> None:
-        job = make_job("worlds:Scripted", arm="sauna", **settings)
+        job = make_job("small_envs:Scripted", arm="sauna", **settings)
         self.config = job.config
         self.learner = make_learner(job.config, make_policy(job.config, job.spaces), job.spaces)
         rng, number = np.random.default_rng(0), job.config.rollout_steps
@@ -121,7 +121,7 @@ def test_the_run_stops_and_the_last_finite_checkpoint_is_kept(
         return plain(learner, state, collected, hypers, order, key)
 
     monkeypatch.setattr(host, "_learn", spoiled)
-    from worlds import Scripted
+    from small_envs import Scripted
 
     run = tmp_path / "run"
     with pytest.raises(SaunaError, match="ppo/0: the update of iteration 2 is not finite"):
@@ -143,5 +143,5 @@ def test_parameters_are_checked_where_the_loss_was_still_finite() -> None:
 def test_a_rate_that_overflows_stops_before_anything_is_saved() -> None:
     recorder = Recorder()
     with pytest.raises(NonFinite, match="iteration 0"):
-        host.train_on_host(make_job("worlds:Scripted", learning_rate=1e38), recorder)
+        host.train_on_host(make_job("small_envs:Scripted", learning_rate=1e38), recorder)
     assert not recorder.rows and not recorder.states

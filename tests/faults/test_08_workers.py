@@ -72,7 +72,7 @@ def _from_inside(rng: random.Random, tally: Tally) -> None:
     """The environment itself does it, at a reset or at a step."""
     what, where = rng.choice(list(INSIDE)), rng.choice(["reset", "step"])
     kwargs = {"what": what, "where": where, "episode": rng.randrange(2, 5)}
-    envs = ProcessEnvs("worlds:Failing", kwargs, SEEDS, 2, timeout=60.0)
+    envs = ProcessEnvs("small_envs:Failing", kwargs, SEEDS, 2, timeout=60.0)
     envs._timeout = DEADLINE
     _until_named(envs, f"{what} at {where}", INSIDE[what], tally, lambda: None)
 
@@ -80,7 +80,7 @@ def _from_inside(rng: random.Random, tally: Tally) -> None:
 def _from_outside(rng: random.Random, tally: Tally) -> None:
     """A signal hits one of the workers at some moment."""
     name, victim = rng.choice(list(OUTSIDE)), rng.randrange(2)
-    envs = ProcessEnvs("worlds:Scripted", {}, SEEDS, 2, timeout=60.0)
+    envs = ProcessEnvs("small_envs:Scripted", {}, SEEDS, 2, timeout=60.0)
     envs._timeout = DEADLINE
     pid = envs._workers[victim].process.pid
     pause = rng.uniform(0.0, 0.3)
@@ -188,7 +188,7 @@ def test_a_worker_that_fails_is_named_in_time_and_none_is_left(tmp_path: Path) -
 def test_a_dead_worker_is_noticed_while_another_one_is_awaited() -> None:
     """Worker 0 takes its time; worker 1 is gone. It must not take worker 0's deadline."""
     kwargs = {"what": "hang", "where": "step", "episode": 1, "seed": episode_seed(0, 0, 0)}
-    envs = ProcessEnvs("worlds:Failing", kwargs, SEEDS, 2, timeout=60.0)
+    envs = ProcessEnvs("small_envs:Failing", kwargs, SEEDS, 2, timeout=60.0)
     tally = Tally()
     pid = envs._workers[1].process.pid
     strikes: list[float] = []
@@ -220,7 +220,7 @@ def test_an_environment_worker_that_hangs_dies_with_its_parent(tmp_path: Path) -
     kwargs = json.dumps({"what": "hang", "where": "step", "episode": 1})
     code = (
         "import numpy as np\nfrom sauna.envs.workers import ProcessEnvs\n"
-        f"envs = ProcessEnvs('worlds:Failing', {kwargs}, {SEEDS}, 1, timeout=60.0)\n"
+        f"envs = ProcessEnvs('small_envs:Failing', {kwargs}, {SEEDS}, 1, timeout=60.0)\n"
         "envs.reset(); print(envs._workers[0].process.pid, flush=True)\n"
         "envs.step(np.zeros((3, 2), np.float32), np.ones(3, bool))"
     )

@@ -40,25 +40,25 @@ def experiment(least: int, seed: int, place: Path) -> Result:
 def _fail_everywhere(
     backend: str, least: int, rng: random.Random, place: Path, tally: Tally
 ) -> None:
-    world = BACKENDS[backend]
-    with played_back(record(world)):
+    env = BACKENDS[backend]
+    with played_back(record(env)):
         whole = Trap()
-        until(place / backend, whole, world)
+        until(place / backend, whole, env)
         expected = Ended(place / backend)
         tally.count(f"file operations of a run on the {backend}", len(whole.ops))
         cases = [(at, number) for at in range(len(whole.ops)) for number in ERRORS]
         if least < len(whole.ops):
             cases = rng.sample(cases, least)
         for at, number in cases:
-            _fail(place / "run", world, at, number, expected, tally)
+            _fail(place / "run", env, at, number, expected, tally)
 
 
-def _fail(run: Path, world: str, at: int, number: int, expected: Ended, tally: Tally) -> None:
+def _fail(run: Path, env: str, at: int, number: int, expected: Ended, tally: Tally) -> None:
     shutil.rmtree(run, ignore_errors=True)
     trap = Trap(at, OSError(number, os.strerror(number), "the disk"))
     clock, said = time.monotonic(), []
     with patch("sauna.api._Silent.say", lambda display, text: said.append(text)):
-        error = until(run, trap, world)
+        error = until(run, trap, env)
     tally.took(time.monotonic() - clock)
     tally.tried += 1
     op = trap.ops[at] if at < len(trap.ops) else None
@@ -73,7 +73,7 @@ def _fail(run: Path, world: str, at: int, number: int, expected: Ended, tally: T
         tally.lose(f"{what}: reported as bad input: {error}")
     _check_kept(run, trap, what, tally)
     try:
-        go(run, world)  # there is space again
+        go(run, env)  # there is space again
     except SaunaError as again:
         tally.lose(f"{what}: cannot go on: {again}")
         return
@@ -118,16 +118,16 @@ def test_every_failing_write_is_told_and_loses_nothing(tmp_path: Path) -> None:
 def test_a_table_that_cannot_be_written_ends_no_training(tmp_path: Path) -> None:
     """Each of its writes, of which the sample above may hold none."""
     tally = Tally()
-    world = BACKENDS["host"]
-    with played_back(record(world)):
+    env = BACKENDS["host"]
+    with played_back(record(env)):
         whole = Trap()
-        until(tmp_path / "whole", whole, world)
+        until(tmp_path / "whole", whole, env)
         expected = Ended(tmp_path / "whole")
         at = [n for n, op in enumerate(whole.ops) if metrics_csv.NAME in op.path]
         at += [n + 1 for n in at if whole.ops[n].kind == "rename"]  # the folder is flushed
         assert {whole.ops[n].path for n in at if metrics_csv.NAME not in whole.ops[n].path} == {"."}
         for n in at:
-            _fail(tmp_path / "run", world, n, errno.ENOSPC, expected, tally)
+            _fail(tmp_path / "run", env, n, errno.ENOSPC, expected, tally)
     assert {whole.ops[n].kind for n in at} >= {"create", "write", "fsync", "rename"}
     assert_held(tally.result(), len(at))
 

@@ -22,7 +22,7 @@ from sauna.config.presets import ARMS, PRESETS
 from sauna.config.settings import FIELDS, TYPES, flag
 
 SECONDS = 1.0  # of CPU
-WORLD = "worlds:Scripted"
+ENV = "small_envs:Scripted"
 COMMANDS = ("train", "compare", "study", "resume", "eval", "bench", "list")
 
 
@@ -52,9 +52,7 @@ def wrong_flag(rng: random.Random) -> Mistake:
     wrong = name
     while wrong in known or wrong == name:
         wrong = "--" + typo(name[2:], rng)
-    return Mistake(
-        ["train", WORLD, f"{wrong}=1"], f"unknown argument '{wrong}=1'; did you mean '--"
-    )
+    return Mistake(["train", ENV, f"{wrong}=1"], f"unknown argument '{wrong}=1'; did you mean '--")
 
 
 def out_of_bounds(rng: random.Random) -> Mistake:
@@ -74,7 +72,7 @@ def out_of_bounds(rng: random.Random) -> Mistake:
         values.append(str(meta["above"]))
     if meta["at_most"] is not None:
         values.append(str(meta["at_most"] + 0.5))
-    return Mistake(["train", WORLD, f"{flag(name)}={rng.choice(values)}"], f"{name}: must be ")
+    return Mistake(["train", ENV, f"{flag(name)}={rng.choice(values)}"], f"{name}: must be ")
 
 
 def unreadable(rng: random.Random) -> Mistake:
@@ -82,7 +80,7 @@ def unreadable(rng: random.Random) -> Mistake:
     names = [n for n in FIELDS if TYPES[n] in texts and n != "env"]
     name = rng.choice(names)
     return Mistake(
-        ["train", WORLD, f"{flag(name)}={rng.choice(texts[TYPES[name]])}"], f"{name}: cannot read"
+        ["train", ENV, f"{flag(name)}={rng.choice(texts[TYPES[name]])}"], f"{name}: cannot read"
     )
 
 
@@ -93,7 +91,7 @@ def unknown_choice(rng: random.Random) -> Mistake:
     wrong = word + rng.choice(["x", "s", "_"])
     arm = "sauna" if name != "backend" else "ppo"
     return Mistake(
-        ["train", WORLD, "--arm", arm, flag(name), wrong], f"{name}: unknown value '{wrong}'"
+        ["train", ENV, "--arm", arm, flag(name), wrong], f"{name}: unknown value '{wrong}'"
     )
 
 
@@ -103,7 +101,7 @@ def unknown_name(rng: random.Random) -> Mistake:
     wrong = word
     while wrong in known:
         wrong = typo(word, rng)
-    return Mistake(["train", WORLD, f"--{kind}", wrong], f"unknown {kind} '{wrong}'")
+    return Mistake(["train", ENV, f"--{kind}", wrong], f"unknown {kind} '{wrong}'")
 
 
 def unread_setting(rng: random.Random) -> Mistake:
@@ -121,26 +119,24 @@ def unread_setting(rng: random.Random) -> Mistake:
             ("init_normalizer", "fresh"),
         ]
     )
-    return Mistake(["train", WORLD, "--arm", "ppo", flag(name), value], f"{name}: not read by arm")
+    return Mistake(["train", ENV, "--arm", "ppo", flag(name), value], f"{name}: not read by arm")
 
 
 def impossible_together(rng: random.Random) -> Mistake:
     return rng.choice(
         [
-            Mistake(["train", WORLD, f"--minibatches={rng.choice([33, 7, 1000])}"], "minibatches:"),
-            Mistake(["train", WORLD, f"--steps={rng.randrange(1, 2048)}"], "steps:"),
-            Mistake(["train", WORLD, "--seeds", f"{(n := rng.randrange(99))},{n}"], "seeds:"),
-            Mistake(["train", WORLD, f"--seeds={-rng.randrange(1, 99)},1"], "seeds:"),
-            Mistake(["train", WORLD, "--arm", "random-drop"], "drop_rate:"),
+            Mistake(["train", ENV, f"--minibatches={rng.choice([33, 7, 1000])}"], "minibatches:"),
+            Mistake(["train", ENV, f"--steps={rng.randrange(1, 2048)}"], "steps:"),
+            Mistake(["train", ENV, "--seeds", f"{(n := rng.randrange(99))},{n}"], "seeds:"),
+            Mistake(["train", ENV, f"--seeds={-rng.randrange(1, 99)},1"], "seeds:"),
+            Mistake(["train", ENV, "--arm", "random-drop"], "drop_rate:"),
+            Mistake(["train", ENV, f"--schedule-start={rng.randrange(1, 9)}e9"], "schedule_start:"),
             Mistake(
-                ["train", WORLD, f"--schedule-start={rng.randrange(1, 9)}e9"], "schedule_start:"
+                ["train", ENV, "--init-from=nowhere"], "init_from: nowhere is no run", "", True
             ),
-            Mistake(
-                ["train", WORLD, "--init-from=nowhere"], "init_from: nowhere is no run", "", True
-            ),
-            Mistake(["train", WORLD, "--gae-over", "kept"], "gae_over:"),
-            Mistake(["train", WORLD, "--arm", "sauna,random-drop", "--drop-rate", "0.1"], "arm:"),
-            Mistake(["train", WORLD, f"--env-processes={rng.randrange(2, 99)}"], "env_processes:"),
+            Mistake(["train", ENV, "--gae-over", "kept"], "gae_over:"),
+            Mistake(["train", ENV, "--arm", "sauna,random-drop", "--drop-rate", "0.1"], "arm:"),
+            Mistake(["train", ENV, f"--env-processes={rng.randrange(2, 99)}"], "env_processes:"),
         ]
     )
 
@@ -153,9 +149,9 @@ def wrong_environment(rng: random.Random) -> Mistake:
         [
             Mistake([command, typo(name[:-3], rng) + name[-3:]], "env: unknown environment"),
             Mistake(["train", f"nowhere{rng.randrange(99)}:Thing"], "env: cannot import"),
-            Mistake(["train", "worlds:Scriptd"], "did you mean 'Scripted'?"),
-            Mistake(["train", WORLD, "--env-kwargs", '{"speed": 3}'], "cannot be made"),
-            Mistake(["train", WORLD, "--env-kwargs", "{speed: 3}"], "env_kwargs: cannot read"),
+            Mistake(["train", "small_envs:Scriptd"], "did you mean 'Scripted'?"),
+            Mistake(["train", ENV, "--env-kwargs", '{"speed": 3}'], "cannot be made"),
+            Mistake(["train", ENV, "--env-kwargs", "{speed: 3}"], "env_kwargs: cannot read"),
             Mistake(["train", "os:system"], "'os' is a part of Python"),
             Mistake(["train"], "no environment given"),
         ]
@@ -167,7 +163,7 @@ def wrong_command(rng: random.Random) -> Mistake:
     wrong = word
     while wrong in COMMANDS:
         wrong = typo(word, rng)
-    return Mistake([wrong, WORLD], f"invalid choice: '{wrong}'")
+    return Mistake([wrong, ENV], f"invalid choice: '{wrong}'")
 
 
 def wrong_run(rng: random.Random) -> Mistake:
@@ -193,16 +189,14 @@ def wrong_config_file(rng: random.Random) -> Mistake:
     return rng.choice(
         [
             Mistake(
-                ["train", WORLD, "--config", "{file}"],
+                ["train", ENV, "--config", "{file}"],
                 f"unknown key '{wrong}'; did you mean",
                 f'{{"{wrong}": 1}}',
             ),
-            Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", '{"gamma": 0.9'),
-            Mistake(["train", WORLD, "--config", "{file}"], "config: cannot read", "[1, 2]"),
-            Mistake(
-                ["train", WORLD, "--config", "{file}"], "twice", '{"gamma": 0.9, "gamma": 0.5}'
-            ),
-            Mistake(["train", WORLD, "--config", "{file}"], "gamma: must be", '{"gamma": 2}'),
+            Mistake(["train", ENV, "--config", "{file}"], "config: cannot read", '{"gamma": 0.9'),
+            Mistake(["train", ENV, "--config", "{file}"], "config: cannot read", "[1, 2]"),
+            Mistake(["train", ENV, "--config", "{file}"], "twice", '{"gamma": 0.9, "gamma": 0.5}'),
+            Mistake(["train", ENV, "--config", "{file}"], "gamma: must be", '{"gamma": 2}'),
         ]
     )
 
@@ -211,7 +205,7 @@ STUDY = ("study", "{file}", "--trust")  # its environment is of a module
 
 
 def wrong_study(rng: random.Random) -> Mistake:
-    start = 'tasks = ["worlds:Scripted"]\n'
+    start = 'tasks = ["small_envs:Scripted"]\n'
     arm = '[[arms]]\nlabel = "ppo"\n'
     return rng.choice(
         [
@@ -232,9 +226,9 @@ def wrong_study(rng: random.Random) -> Mistake:
                 "invalid choice: 'mars'",
                 start + arm,
             ),
-            Mistake(["compare", WORLD, "--arms", "ppo,ppo"], "twice"),
-            Mistake(["compare", WORLD, "--arms", "ppo,suana"], "did you mean 'sauna'?"),
-            Mistake(["compare", WORLD, "--gamma", "1.5"], "gamma"),
+            Mistake(["compare", ENV, "--arms", "ppo,ppo"], "twice"),
+            Mistake(["compare", ENV, "--arms", "ppo,suana"], "did you mean 'sauna'?"),
+            Mistake(["compare", ENV, "--gamma", "1.5"], "gamma"),
             Mistake(["compare"], "no environment given"),
             Mistake(["list", "arm"], "invalid choice: 'arm'"),
             Mistake(["bench", "--rounds", "0"], "rounds: must be a whole number"),
@@ -243,25 +237,25 @@ def wrong_study(rng: random.Random) -> Mistake:
 
 
 def wrong_on_device(rng: random.Random) -> Mistake:
-    walk, pole = "jax_worlds:walk", "gymnax/CartPole-v1"
+    walk, pole = "jax_envs:walk", "gymnax/CartPole-v1"
     fault = rng.choice(["raises", "branches", "observation", "reward", "terminated", "state"])
-    faulty = ["train", "jax_worlds:faulty", "--env-kwargs", f'{{"fault": "{fault}"}}']
+    faulty = ["train", "jax_envs:faulty", "--env-kwargs", f'{{"fault": "{fault}"}}']
     said = {
         "raises": "cannot be played: ValueError: two lines",
         "branches": "cannot be played: TracerBool",
         "state": "its state has other arrays",
         "observation": "observation is of shape",
     }
-    import jax_worlds
+    import jax_envs
 
-    del jax_worlds
+    del jax_envs
     only, count = "only read with backend device", rng.randrange(1, 9)
     at_once = [
-        Mistake(["train", WORLD, f"--device={rng.choice(['cpu', 'auto'])}"], f"device: {only}"),
-        Mistake(["train", WORLD, f"--devices={count}"], f"devices: {only}"),
-        Mistake(["train", WORLD, "--reset=cached"], f"reset: {only}"),
-        Mistake(["train", WORLD, "--distributed=here:1,2,0"], f"distributed: {only}"),
-        Mistake(["compare", WORLD, f"--devices={count}"], f"devices: {only}"),
+        Mistake(["train", ENV, f"--device={rng.choice(['cpu', 'auto'])}"], f"device: {only}"),
+        Mistake(["train", ENV, f"--devices={count}"], f"devices: {only}"),
+        Mistake(["train", ENV, "--reset=cached"], f"reset: {only}"),
+        Mistake(["train", ENV, "--distributed=here:1,2,0"], f"distributed: {only}"),
+        Mistake(["compare", ENV, f"--devices={count}"], f"devices: {only}"),
         Mistake(["train", pole, f"--env-processes={count}", "--seeds=9"], "env_processes: not"),
         Mistake(["compare", pole, "--env-processes=1"], "env_processes: not read"),
         Mistake(["train", pole, "--distributed=here"], "distributed: 'here' is not HOST:PORT,"),
@@ -271,17 +265,17 @@ def wrong_on_device(rng: random.Random) -> Mistake:
     ]
     after_imports = [
         Mistake(["train", walk, "--env-processes=1"], "env_processes: not read"),
-        Mistake(["train", WORLD, "--backend=device"], "backend: worlds:Scripted is not"),
+        Mistake(["train", ENV, "--backend=device"], "backend: small_envs:Scripted is not"),
         Mistake(
             ["train", "CartPole-v1", "--backend=device"],
             "CartPole-v1 does not run on the device",
         ),
         Mistake(["train", walk, "--devices=2"], "devices: 1 members of 1 environments cannot be"),
-        Mistake(["train", f"jax_worlds:{typo('unlucky', rng)}"], "did you mean 'unlucky'?"),
+        Mistake(["train", f"jax_envs:{typo('unlucky', rng)}"], "did you mean 'unlucky'?"),
         Mistake(["train", walk, "--network=nature-cnn"], "network: nature-cnn does not fit"),
-        Mistake(["train", walk, "--env-kwargs", '{"speed": 1}'], "env_kwargs: jax_worlds:walk"),
-        Mistake(["train", "jax_worlds:no_env"], "gives no environment, but int"),
-        Mistake(["train", "jax_worlds:no_env", "--backend=device"], "is not a sauna.JaxEnv"),
+        Mistake(["train", walk, "--env-kwargs", '{"speed": 1}'], "env_kwargs: jax_envs:walk"),
+        Mistake(["train", "jax_envs:no_env"], "gives no environment, but int"),
+        Mistake(["train", "jax_envs:no_env", "--backend=device"], "is not a sauna.JaxEnv"),
         Mistake(faulty, said.get(fault, f"its {fault} is not of shape")),
     ]
     return rng.choice([*at_once, *(mistake._replace(imports=True) for mistake in after_imports)])
@@ -335,7 +329,7 @@ def _judge(
     if code != 2 or said not in errors:
         tally.miss(f"{what}: {code}, {errors[:300]!r} instead of {said!r}")
     *frames, line = errors.splitlines() or [""]  # above it, where the user's own code raised
-    if not line.startswith("sauna: ") or (frames and "worlds.py" not in frames[0]):
+    if not line.startswith("sauna: ") or (frames and "small_envs.py" not in frames[0]):
         tally.lose(f"{what}: not one line: {errors[:300]!r}")
     if any(folder.iterdir()):
         tally.lose(f"{what}: created {list(folder.iterdir())}")

@@ -23,7 +23,7 @@ from sauna.system import run_directory
 SEEDS = 20
 BAD = 1  # the seed that fails
 # On the host and on the device; and what has to be said of the seed.
-TASKS = {"worlds:Unlucky": "out of luck", "jax_worlds:unlucky": "reward is not finite"}
+TASKS = {"small_envs:Unlucky": "out of luck", "jax_envs:unlucky": "reward is not finite"}
 QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
 PATIENCE = 900.0
 
@@ -159,7 +159,7 @@ def test_the_other_seeds_go_on_and_no_mean_hides_the_failed_one(tmp_path: Path) 
     """The product's own scheduling, splitting, gathering and table; only training is pretended."""
     arms = [{"label": "ppo"}]
     spec = read_spec(
-        {"name": "unlucky", "tasks": ["worlds:Unlucky"], "seeds": SEEDS, "arms": arms, **QUICK}
+        {"name": "unlucky", "tasks": ["small_envs:Unlucky"], "seeds": SEEDS, "arms": arms, **QUICK}
     )
     units, folder = units_of(spec, 3), tmp_path / "units"
     tally, place = Tally(), tmp_path / "unlucky"
@@ -171,6 +171,6 @@ def test_the_other_seeds_go_on_and_no_mean_hides_the_failed_one(tmp_path: Path) 
         except KeyboardInterrupt:
             tally.count("kills")
     write(spec, units, folder, place, "sauna study unlucky")
-    _judge(place, {"worlds:Unlucky": "out of luck"}, tally)
+    _judge(place, {"small_envs:Unlucky": "out of luck"}, tally)
     assert tally.notes["kills"] == 4
     assert_held(tally.result(), SEEDS)

@@ -28,30 +28,30 @@ def experiment(least: int, seed: int, place: Path) -> Result:
 def _cut_off_everywhere(
     backend: str, least: int, rng: random.Random, place: Path, tally: Tally
 ) -> None:
-    world = BACKENDS[backend]
-    with played_back(record(world)):
+    env = BACKENDS[backend]
+    with played_back(record(env)):
         whole = Trap()
-        until(place / backend, whole, world)
+        until(place / backend, whole, env)
         expected = Ended(place / backend)
         count = len(whole.ops)
         points = range(count) if least >= count else sorted(rng.sample(range(count), least // 2))
         tally.count(f"file operations of a run on the {backend}", count)
         for at in points:
-            _kill(place / "run", world, at, expected, tally)
+            _kill(place / "run", env, at, expected, tally)
         for at, tree in _power_cuts(whole.ops, points, rng):
             shutil.rmtree(place / "run", ignore_errors=True)
             make_tree(tree, place / "run")
             tally.count("power cuts")
-            _go_on(place / "run", world, f"power cut before operation {at}", expected, tally)
+            _go_on(place / "run", env, f"power cut before operation {at}", expected, tally)
 
 
-def _kill(run: Path, world: str, at: int, expected: Ended, tally: Tally) -> None:
+def _kill(run: Path, env: str, at: int, expected: Ended, tally: Tally) -> None:
     shutil.rmtree(run, ignore_errors=True)
-    until(run, Trap(at), world)
+    until(run, Trap(at), env)
     tally.count("kills")
     if run_directory.rows(run) and not (run / "checkpoints").exists():
         tally.count("rows, but no checkpoint yet")
-    _go_on(run, world, f"killed before operation {at}", expected, tally)
+    _go_on(run, env, f"killed before operation {at}", expected, tally)
 
 
 def _power_cuts(ops: list[Op], points: object, rng: random.Random) -> list[tuple[int, Tree]]:
@@ -64,11 +64,11 @@ def _power_cuts(ops: list[Op], points: object, rng: random.Random) -> list[tuple
     return found
 
 
-def _go_on(run: Path, world: str, what: str, expected: Ended, tally: Tally) -> None:
+def _go_on(run: Path, env: str, what: str, expected: Ended, tally: Tally) -> None:
     tally.tried += 1
     clock = time.monotonic()
     try:
-        go(run, world)
+        go(run, env)
     except SaunaError as error:
         tally.lose(f"{what}: {error}")
         return

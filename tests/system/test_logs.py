@@ -96,7 +96,7 @@ def test_what_is_no_row_is_no_row(line: bytes) -> None:
 def run(tmp_path: Path) -> Path:
     path = tmp_path / "unit" / "run"
     settings = {**SMALL, "checkpoint_every": 2, "keep_checkpoints": 9, "arm": "ppo"}
-    sauna.train("worlds:Scripted", out=path, quiet=True, **settings)
+    sauna.train("small_envs:Scripted", out=path, quiet=True, **settings)
     return path
 
 
@@ -142,7 +142,7 @@ def test_eval_names_the_damage_and_uses_what_fits(run: Path) -> None:
 
 
 def test_a_study_continues_a_complete_run_whose_rows_are_damaged(run: Path, tmp_path) -> None:
-    unit = Unit("unit", "worlds:Scripted", "ppo", (0,), {})
+    unit = Unit("unit", "small_envs:Scripted", "ppo", (0,), {})
     said: list[str] = []
     reopen_damaged([unit], tmp_path, said.append)
     assert said == [] and unit.is_complete(tmp_path)

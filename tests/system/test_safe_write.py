@@ -115,7 +115,7 @@ def test_a_planted_run_does_not_write_elsewhere(tmp_path: Path, precious: Path) 
     elsewhere.mkdir()
     run.symlink_to(elsewhere)
     settings = {**SMALL, "arm": "ppo", "checkpoint_every": 2, "quiet": True}
-    sauna.train("worlds:Scripted", out=run, **settings)
+    sauna.train("small_envs:Scripted", out=run, **settings)
     assert (elsewhere / "summary.json").exists()
     (run / "summary.json").unlink()
     (run / "summary.json").symlink_to(precious)

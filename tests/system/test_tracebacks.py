@@ -13,7 +13,7 @@ import sauna
 from helpers import SMALL, environment
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.tracebacks import WorkerTraceback, cause_of, describe_failure, user_frames
-from worlds import Failing
+from small_envs import Failing
 
 LINE = 'raise ValueError("the motor is on fire")'
 FAILING = {"env_kwargs": {"what": "raise", "where": "step", "episode": 4}, "arm": "ppo", **SMALL}
@@ -65,9 +65,11 @@ def test_an_exception_of_this_process_is_the_cause_itself() -> None:
 def test_a_worker_that_fails_leaves_its_traceback(tmp_path: Path, env_processes: int) -> None:
     run = tmp_path / "run"
     with pytest.raises(SaunaError, match="motor is on fire") as caught:
-        sauna.train("worlds:Failing", out=run, quiet=True, env_processes=env_processes, **FAILING)
+        sauna.train(
+            "small_envs:Failing", out=run, quiet=True, env_processes=env_processes, **FAILING
+        )
     kept = (run / "failure.txt").read_text()
-    assert LINE in kept and "worlds.py" in kept and "Traceback" in kept
+    assert LINE in kept and "small_envs.py" in kept and "Traceback" in kept
     assert str(run / "failure.txt") in str(caught.value)
     assert isinstance(caught.value.__cause__, WorkerTraceback)
     shown = user_frames(caught.value)
@@ -89,7 +91,15 @@ def test_the_command_line_shows_the_users_frames(tmp_path: Path) -> None:
         "        return helper()\n\n\ndef helper():\n    return 1 / 0\n"
     )
     done = subprocess.run(
-        [sys.executable, "-m", "sauna", "train", "worlds:Scripted", "--network", "mine:Network"],
+        [
+            sys.executable,
+            "-m",
+            "sauna",
+            "train",
+            "small_envs:Scripted",
+            "--network",
+            "mine:Network",
+        ],
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -108,5 +118,5 @@ def test_the_command_line_shows_the_users_frames(tmp_path: Path) -> None:
 
 def test_bad_input_found_before_the_run_has_its_cause() -> None:
     with pytest.raises(BadInput) as caught:
-        sauna.train("worlds:Raising", quiet=True)
+        sauna.train("small_envs:Raising", quiet=True)
     assert isinstance(caught.value.__cause__, ValueError)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sauna
-from faults.canned import SAVED, SETTINGS, WORLD, Ended, go, played_back, record
+from faults.canned import ENV, SAVED, SETTINGS, Ended, go, played_back, record
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.training.summary import STOPS
@@ -30,7 +30,7 @@ def test_a_callback_sees_a_copy_of_each_row_in_order(tmp_path: Path) -> None:
         row["env_steps"] = -1
 
     with played_back(record()):
-        sauna.train(WORLD, out=tmp_path / "run", quiet=True, callback=look, **SAVED, **SETTINGS)
+        sauna.train(ENV, out=tmp_path / "run", quiet=True, callback=look, **SAVED, **SETTINGS)
     assert seen == run_directory.rows(tmp_path / "run") == record().rows
 
 
@@ -43,7 +43,7 @@ def test_an_exception_of_a_callback_is_its_own_and_the_run_goes_on_later(tmp_pat
 
     with played_back(record()):
         with pytest.raises(OfUser, match="a typo") as caught:
-            sauna.train(WORLD, out=run, quiet=True, callback=fail, **SAVED, **SETTINGS)
+            sauna.train(ENV, out=run, quiet=True, callback=fail, **SAVED, **SETTINGS)
         assert "fail" in [frame.name for frame in caught.traceback]
         (note,) = caught.value.__notes__
         assert "iteration 3 of ppo/0" in note and f"sauna resume {run}" in note
@@ -62,7 +62,7 @@ def test_a_stop_is_in_the_checkpoint_at_the_end_of_the_same_iteration(tmp_path: 
         return row["member"] == "ppo/0" and row["iteration"] >= 1
 
     with trained_here():
-        result = sauna.train(WORLD, out=run, quiet=True, callback=stop, **settings)
+        result = sauna.train(ENV, out=run, quiet=True, callback=stop, **settings)
         metrics = (run / "metrics.jsonl").read_bytes()
         assert [r["iteration"] for r in result.metrics if r["member"] == "ppo/0"] == [0, 1]
         assert [r["iteration"] for r in result.metrics if r["member"] == "ppo/1"] == [*range(6)]
@@ -84,7 +84,7 @@ def test_a_stop_is_in_the_checkpoint_at_the_end_of_the_same_iteration(tmp_path: 
 def test_callbacks_do_not_run_on_several_machines(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="callback: not called with distributed"):
         sauna.train(
-            "jax_worlds:walk",
+            "jax_envs:walk",
             distributed="h:1,2,0",
             quiet=True,
             out=tmp_path / "run",

@@ -72,18 +72,18 @@ def test_a_network_that_cannot_train_is_named_before_the_run(network: str, words
 
 
 def test_a_small_board_trains_with_a_small_cnn_an_mlp_and_ones_own_network() -> None:
-    job = make_job("worlds:Board", arm="ppo", network="auto", **SETTINGS)
+    job = make_job("small_envs:Board", arm="ppo", network="auto", **SETTINGS)
     assert (job.config.network, job.spaces.observation_high) == ("small-cnn", 3.0)
     kernel = train_here(job).final["ppo/0/params/policy_trunk/conv_0/kernel"]
     assert kernel.shape == (3, 3, 1, 16)
-    job = make_job("worlds:Board", arm="ppo", network="mlp", **SETTINGS)
+    job = make_job("small_envs:Board", arm="ppo", network="mlp", **SETTINGS)
     kernel = train_here(job).final["ppo/0/params/policy_trunk/layer_0/kernel"]
     assert kernel.shape == (25, 64)
     check_plugins(of("Embedded"), BOARD)
-    job = make_job("worlds:Board", arm="ppo", network="own_networks:Embedded", **SETTINGS)
+    job = make_job("small_envs:Board", arm="ppo", network="own_networks:Embedded", **SETTINGS)
     assert len(train_here(job).rows) == 4
     with pytest.raises(BadInput, match=r"\(5, 5, 1\) \(it needs 36 x 36 pixels\)"):
-        make_job("worlds:Board", network="nature-cnn")
+        make_job("small_envs:Board", network="nature-cnn")
 
 
 @pytest.mark.parametrize("network", ["mlp", "nature-cnn"])
@@ -102,7 +102,7 @@ def test_bytes_are_divided_by_the_highest_one(network: str) -> None:
 
 def test_an_instance_passed_by_value_trains(tmp_path) -> None:
     run = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         quiet=True,
         out=tmp_path / "run",
         network=nn.Sequential([own_networks.Wide(6), nn.Dense(4)]),

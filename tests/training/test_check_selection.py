@@ -117,7 +117,7 @@ def test_a_mistake_is_one_line_before_the_run(settings: dict[str, Any], text: st
 
 def test_a_mistake_ends_with_2_and_creates_nothing(tmp_path) -> None:
     settings = {"arm": "ppo", "rollout-steps": 16, "minibatches": 4, "steps": 64}
-    command = ["worlds:Scripted", *(f"--{name}={value}" for name, value in settings.items())]
+    command = ["small_envs:Scripted", *(f"--{name}={value}" for name, value in settings.items())]
     mistakes = (
         ["--sampler", "own_rules:too_short"],
         ["--sampler", "kondo", "--sampler-kwargs", '{"share": 7}'],
@@ -132,7 +132,7 @@ def test_rules_train_by_name_and_by_value(tmp_path) -> None:
     """A quarter of the rows: minibatches of 2. The sampler's state is a Python number."""
     settings = {**SMALL, "arm": "ppo", "steps": 64, "selection_mode": "smaller"}
     found = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         out=tmp_path / "one",
         quiet=True,
         sampler="own_rules:newest",
@@ -148,7 +148,7 @@ def test_rules_train_by_name_and_by_value(tmp_path) -> None:
     import own_rules
 
     again = sauna.train(
-        "worlds:Scripted",
+        "small_envs:Scripted",
         out=tmp_path / "two",
         quiet=True,
         sampler=own_rules.newest,
@@ -213,7 +213,7 @@ MISTAKEN = [
 @pytest.mark.parametrize("settings, text", MISTAKEN)
 def test_rules_that_cannot_work_together_are_refused(settings: dict[str, Any], text: str) -> None:
     with pytest.raises(BadInput) as found:
-        resolve({"env": "worlds:Scripted", "arm": "ppo", **settings})
+        resolve({"env": "small_envs:Scripted", "arm": "ppo", **settings})
     assert text in str(found.value)
 
 
@@ -224,7 +224,7 @@ def test_joined_rules_are_those_of_each_part() -> None:
     turned = arm_settings("avec+sauna")
     assert {name: turned[name] for name in both} == both
     assert arm_settings("gigaflow+random") == {**ARMS["gigaflow"], "control": "random"}
-    resolved = resolve({"env": "worlds:Scripted", "arm": "gigaflow+stride"})
+    resolved = resolve({"env": "small_envs:Scripted", "arm": "gigaflow+stride"})
     assert (resolved.sampler, resolved.control, resolved.filter) == ("gigaflow", "stride", "none")
 
 
@@ -239,7 +239,7 @@ FREE = [
 
 @pytest.mark.parametrize("arm, settings, name, value", FREE)
 def test_what_an_arm_leaves_free(arm: str, settings: dict[str, Any], name: str, value: Any) -> None:
-    found = resolve({"env": "worlds:Scripted", "arm": arm, **settings})
+    found = resolve({"env": "small_envs:Scripted", "arm": arm, **settings})
     assert str(getattr(found, name)).replace(" ", "") == value
 
 
@@ -278,6 +278,6 @@ OFF = {
 
 def test_a_hook_that_is_off_is_the_same_config_as_none_given() -> None:
     """So the same program, and the same bits; `six_runs.py` holds them to those of before."""
-    plain = {"env": "worlds:Scripted", "arm": "sauna,vex-head"}
+    plain = {"env": "small_envs:Scripted", "arm": "sauna,vex-head"}
     assert resolve({**plain, **OFF}) == resolve(plain)
     assert np.all([getattr(Config(), name) == value for name, value in OFF.items()])

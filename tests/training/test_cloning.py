@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sauna
-import worlds
+import small_envs
 from helpers import SMALL, equal, make_job, policy_output, train_here
 from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
@@ -27,17 +27,17 @@ from threads import trained_here
 NAME = "data:episodes.parquet"
 CLONING = {"init_from": NAME, "clone_epochs": 3}
 SETTINGS: dict[str, Any] = {**SMALL, "arm": "ppo", "processes": 1, "seeds": 2, **CLONING}
-WORLD, CHOICES = "worlds:Scripted", "worlds:MatchingAction"
+ENV, CHOICES = "small_envs:Scripted", "small_envs:MatchingAction"
 
 
-def played(world: str, number: int = 12, length: int = 20) -> list[Stored]:
+def played(env: str, number: int = 12, length: int = 20) -> list[Stored]:
     """Episodes whose action is the sign of the first observation; some are terminated."""
-    made, found = getattr(worlds, world.partition(":")[2])(), []
+    made, found = getattr(small_envs, env.partition(":")[2])(), []
     generator = np.random.default_rng(0)
     for episode in range(number):
         seen = generator.normal(size=(length + 1, *made.observation_space.shape)) + episode
         right = seen[:-1, 0] > number / 2
-        if isinstance(made.action_space, worlds.spaces.Discrete):
+        if isinstance(made.action_space, small_envs.spaces.Discrete):
             action = right.astype(np.int64)
         else:
             action = np.repeat(np.where(right, 0.5, -0.5)[:, None], 2, 1)
@@ -45,10 +45,10 @@ def played(world: str, number: int = 12, length: int = 20) -> list[Stored]:
     return found
 
 
-def data_of(world: str, episodes: list[Stored] | None = None) -> Demonstrations:
-    made = getattr(worlds, world.partition(":")[2])()
+def data_of(env: str, episodes: list[Stored] | None = None) -> Demonstrations:
+    made = getattr(small_envs, env.partition(":")[2])()
     spaces = describe(made.observation_space, made.action_space)
-    return demonstrations(episodes or played(world), spaces, made.action_space, False, NAME)
+    return demonstrations(episodes or played(env), spaces, made.action_space, False, NAME)
 
 
 @pytest.fixture(autouse=True)
@@ -57,20 +57,20 @@ def data(monkeypatch) -> None:
     monkeypatch.setattr(cloning, "_read", lambda prepared: data_of(prepared.config.env))
 
 
-def initial(world: str, say: Any = print, **more: Any) -> tuple[dict[str, np.ndarray], dict]:
-    found = read_initial(prepare({"env": world, **SETTINGS, **more}), say, False)
+def initial(env: str, say: Any = print, **more: Any) -> tuple[dict[str, np.ndarray], dict]:
+    found = read_initial(prepare({"env": env, **SETTINGS, **more}), say, False)
     assert found is not None
     return found
 
 
-@pytest.mark.parametrize("world", [WORLD, CHOICES])
-def test_members_start_with_the_clones_weights_and_the_datas_statistics(world: str) -> None:
+@pytest.mark.parametrize("env", [ENV, CHOICES])
+def test_members_start_with_the_clones_weights_and_the_datas_statistics(env: str) -> None:
     said: list[str] = []
-    arrays, origin = initial(world, said.append, init_normalizer="kept")
-    job = make_job(world, **{n: v for n, v in SETTINGS.items() if n not in CLONING})
+    arrays, origin = initial(env, said.append, init_normalizer="kept")
+    job = make_job(env, **{n: v for n, v in SETTINGS.items() if n not in CLONING})
     state = train_here(job._replace(initial=arrays), stop=0).final
     fresh = train_here(job, stop=0).final
-    data = data_of(world)
+    data = data_of(env)
     seen = np.concatenate([data.observation, data.final])
     for member in ("ppo/0", "ppo/1"):
         own = under(f"{member}/", state)
@@ -85,21 +85,21 @@ def test_members_start_with_the_clones_weights_and_the_datas_statistics(world: s
     assert not equal(under("ppo/0/params/", state), under("ppo/1/params/", state))
     assert (origin["episodes"], origin["env_steps"]) == (12, 240)
     assert len(said) == 2 and said[0].startswith(f"ppo/0: cloned {NAME} (12 episodes, 240 env")
-    word = "accuracy" if world == CHOICES else "explained variance of actions"
+    word = "accuracy" if env == CHOICES else "explained variance of actions"
     assert word in said[0] and "log-likelihood" in said[0] and "loss" in said[0]
 
 
 @pytest.mark.parametrize("distribution", ["squashed", "beta", "gsde"])
 def test_every_distribution_of_actions_is_fitted(distribution: str, monkeypatch) -> None:
     """Recorded actions are 0.9 or -0.9; of numbers before a tanh these would be 0.72."""
-    data = data_of(WORLD)
+    data = data_of(ENV)
     data = data._replace(action=1.8 * data.action)
     monkeypatch.setattr(cloning, "_read", lambda prepared: data)
     fast = {"clone_epochs": 20, "clone_learning_rate": 0.03}
-    arrays, origin = initial(WORLD, distribution=distribution, seeds=1, **fast)
+    arrays, origin = initial(ENV, distribution=distribution, seeds=1, **fast)
     own = under("ppo/0/observation_moments/", arrays)
     seen = normalize(Moments(**own), data.observation, 10.0)
-    job = make_job(WORLD, arm="ppo", distribution=distribution)
+    job = make_job(ENV, arm="ppo", distribution=distribution)
     output = policy_output(job, arrays, "ppo/0", seen)
     made = make_policy(job.config, job.spaces).distribution
     action = to_env(made, np.asarray(made.mode(output.policy)))
@@ -110,7 +110,7 @@ def test_every_distribution_of_actions_is_fitted(distribution: str, monkeypatch)
 
 
 def test_pictures_beside_numbers_are_cloned_and_have_no_moments(monkeypatch) -> None:
-    env, number = worlds.Camera(), 9
+    env, number = small_envs.Camera(), 9
     spaces, read = (
         describe(env.observation_space, env.action_space),
         observation_reader(env.observation_space),
@@ -125,21 +125,21 @@ def test_pictures_beside_numbers_are_cloned_and_have_no_moments(monkeypatch) -> 
     data = demonstrations(episodes, spaces, env.action_space, False, NAME)
     monkeypatch.setattr(cloning, "_read", lambda prepared: data)
     settings = {"network": "mlp", "seeds": 1}
-    arrays, origin = initial("worlds:Camera", clone_learning_rate=0.01, **settings)
+    arrays, origin = initial("small_envs:Camera", clone_learning_rate=0.01, **settings)
     numbers = np.concatenate([data.observation, data.final])[:, :2]
     np.testing.assert_allclose(arrays["ppo/0/observation_moments/mean"], numbers.mean(0))
     found = origin["members"]["ppo/0"]
     assert found["held_out"]["log_likelihood"] > found["before"]["log_likelihood"]
     plain = {name: value for name, value in SETTINGS.items() if name not in CLONING}
-    job = prepare({"env": "worlds:Camera", **plain, **settings}).job(None)
+    job = prepare({"env": "small_envs:Camera", **plain, **settings}).job(None)
     state = train_here(job._replace(initial=arrays), stop=0).final
     assert equal(under("ppo/0/params/", state), under("ppo/0/params/", arrays))
 
 
 def test_reward_moments_are_those_of_the_discounted_return() -> None:
-    arrays, _ = initial(WORLD, init_normalizer="kept", gamma=0.5, seeds=1)
+    arrays, _ = initial(ENV, init_normalizer="kept", gamma=0.5, seeds=1)
     sums = []
-    for episode in played(WORLD):
+    for episode in played(ENV):
         now = 0.0
         for reward in episode.reward:
             now = 0.5 * now + reward
@@ -159,7 +159,7 @@ def test_a_clone_depends_on_its_own_seed_alone() -> None:
 def test_a_resume_needs_the_data_no_more(tmp_path: Path, monkeypatch) -> None:
     run = tmp_path / "run"
     with trained_here():
-        sauna.train(WORLD, out=run, quiet=True, **SETTINGS)
+        sauna.train(ENV, out=run, quiet=True, **SETTINGS)
         expected = (run / "metrics.jsonl").read_bytes()
         assert run_directory.read_config(run)["initial"]["env_steps"] == 240
         (run / "summary.json").unlink()
@@ -172,22 +172,22 @@ def test_a_resume_needs_the_data_no_more(tmp_path: Path, monkeypatch) -> None:
 def test_what_cannot_be_cloned_is_refused_in_a_line(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.undo()
     refused = {
-        "one episode": (played(WORLD)[:1], "1 episodes; at least 2 are needed"),
+        "one episode": (played(ENV)[:1], "1 episodes; at least 2 are needed"),
         "shape": (played(CHOICES), "its observations are of shape"),
         "nan": (
-            [*played(WORLD), played(WORLD)[0]._replace(reward=np.full(20, np.nan))],
+            [*played(ENV), played(ENV)[0]._replace(reward=np.full(20, np.nan))],
             "not every reward is finite",
         ),
     }
     for episodes, message in refused.values():
         monkeypatch.setattr(cloning, "read_parquet", lambda *given, e=episodes: e)
         with pytest.raises(BadInput, match=message):
-            initial(WORLD)
+            initial(ENV)
     fresh = {"init_normalizer": "fresh"}
     with pytest.raises(BadInput, match="fresh would show a clone what it was not fitted to"):
-        initial(WORLD, **fresh)
+        initial(ENV, **fresh)
     with pytest.raises(BadInput, match="has no action masks"):
-        initial("worlds:Choosy", action_mask=True)
+        initial("small_envs:Choosy", action_mask=True)
     with pytest.raises(BadInput, match="clone_epochs: not read"):
-        sauna.train(WORLD, out=tmp_path / "run", quiet=True, **{**SETTINGS, "init_from": "RUN"})
+        sauna.train(ENV, out=tmp_path / "run", quiet=True, **{**SETTINGS, "init_from": "RUN"})
     assert list(tmp_path.iterdir()) == []

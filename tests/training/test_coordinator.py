@@ -70,7 +70,7 @@ def test_nobody_has_to_read_what_is_said(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize(
-    "env", ["worlds:MatchingAction", pytest.param("jax_worlds:walk", marks=pytest.mark.slow)]
+    "env", ["small_envs:MatchingAction", pytest.param("jax_envs:walk", marks=pytest.mark.slow)]
 )
 def test_a_run_that_pauses_is_saved_there_and_goes_on_to_the_same_bytes(
     env: str, tmp_path: Path

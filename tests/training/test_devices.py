@@ -20,7 +20,7 @@ from sauna.training.loop.device_program import make_mesh
 from sauna.training.loop.multihost import HostRank, read_host_rank
 
 SETTINGS = [
-    "jax_worlds:walk",
+    "jax_envs:walk",
     "--arm",
     "sauna",
     "--threshold",
@@ -108,14 +108,14 @@ def test_machines_with_other_settings_do_not_train_together(tmp_path: Path) -> N
 
 def test_only_machine_0_writes_a_run(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="machine 0 writes the run"):
-        sauna.train("jax_worlds:walk", distributed="h:1,2,1", quiet=True, out=tmp_path / "run")
+        sauna.train("jax_envs:walk", distributed="h:1,2,1", quiet=True, out=tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_devices_that_would_be_idle_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"3 members of 4 environments .* evenly over 5 devices"):
         sauna.train(
-            "jax_worlds:walk",
+            "jax_envs:walk",
             seeds=3,
             envs=4,
             devices=5,
@@ -129,7 +129,7 @@ def test_devices_that_would_be_idle_are_refused(tmp_path: Path) -> None:
 def test_one_program_is_not_shared_over_processes(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"processes: 3 asked for, but .* one program"):
         sauna.train(
-            "jax_worlds:walk",
+            "jax_envs:walk",
             seeds=4,
             envs=4,
             devices=2,
@@ -143,7 +143,7 @@ def test_one_program_is_not_shared_over_processes(tmp_path: Path) -> None:
 
 def test_a_run_on_the_device_is_never_resumed_inexactly(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    sauna.train("jax_worlds:walk", quiet=True, out=run, **SMALL)
+    sauna.train("jax_envs:walk", quiet=True, out=run, **SMALL)
     (run / "summary.json").unlink()
     with pytest.raises(BadInput, match="inexact: a run on the device"):
         sauna.resume(run, inexact=True, quiet=True)

@@ -18,11 +18,11 @@ from sauna.config.presets import ARMS, resolve
 from sauna.envs.spaces import Spaces, describe
 from sauna.system.errors import BadInput
 from sauna.training.prepare import prepare
-from worlds import Boxed
+from small_envs import Boxed
 
 slow = pytest.mark.slow
 KINDS = ("squashed", "beta", "gsde")
-HOST, DEVICE = "worlds:Boxed", "jax_worlds:walk"
+HOST, DEVICE = "small_envs:Boxed", "jax_envs:walk"
 VECTOR = Spaces("vector", (11,), "continuous", (3,), "", "")
 
 
@@ -132,9 +132,9 @@ def test_what_does_not_go_together_is_refused(settings: dict[str, Any], text: st
 def test_actions_without_bounds_and_discrete_ones_are_refused() -> None:
     for kind in ("squashed", "beta"):
         with pytest.raises(BadInput, match=r"needs bounds of every action"):
-            prepare({"env": "worlds:Unbounded", "distribution": kind, **SMALL})
+            prepare({"env": "small_envs:Unbounded", "distribution": kind, **SMALL})
     with pytest.raises(BadInput, match=r"distribution: not read by .*continuous actions"):
-        prepare({"env": "worlds:GoodAction", "distribution": "gsde", **SMALL})
+        prepare({"env": "small_envs:GoodAction", "distribution": "gsde", **SMALL})
 
 
 def test_the_default_is_the_gaussian_to_the_bit() -> None:

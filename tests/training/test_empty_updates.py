@@ -37,7 +37,7 @@ def test_a_run_that_learns_nothing_fails(tmp_path, capsys) -> None:
     settings = {**SMALL, "steps": 32 * 12, "threshold": 1e30, "dropped": "mask"}
     with pytest.raises(SaunaError, match="kept no sample in 10 iterations"):
         sauna.train(
-            "worlds:Scripted",
+            "small_envs:Scripted",
             arm="sauna",
             filter="own_rules:nothing",
             out=tmp_path / "r",
@@ -48,7 +48,7 @@ def test_a_run_that_learns_nothing_fails(tmp_path, capsys) -> None:
 
 def test_a_minibatch_of_one_sample_is_refused() -> None:
     with pytest.raises(BadInput, match="minibatches: 32 of 32 samples leave 1 each"):
-        sauna.train("worlds:Scripted", **{**SMALL, "minibatches": 32})
+        sauna.train("small_envs:Scripted", **{**SMALL, "minibatches": 32})
 
 
 def test_a_small_minibatch_is_named_and_trained_with() -> None:

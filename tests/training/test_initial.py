@@ -98,7 +98,7 @@ def test_it_is_copied_so_that_a_resume_needs_no_other_run(trained, tmp_path: Pat
 
 def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> None:
     env, run = trained
-    other = "worlds:Endless"
+    other = "small_envs:Endless"
     for more, message in (
         ({"hidden": "8,9"}, "hidden is 8,8 in .*, and 8,9 here"),
         ({"activation": "relu"}, "activation is tanh in .*, and relu here"),
@@ -110,7 +110,7 @@ def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> No
         settings = {**SETTINGS, "init_from": str(run), **more}
         with pytest.raises(BadInput, match=message):
             sauna.train(env, out=tmp_path / "new", quiet=True, **settings)
-    if env.startswith("worlds"):
+    if env.startswith("small_envs"):
         with pytest.raises(BadInput, match=f"has other spaces than {other}: "):
             sauna.train(other, out=tmp_path / "new", quiet=True, init_from=str(run), **SETTINGS)
     assert list(tmp_path.iterdir()) == []

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sauna
-import worlds
+import small_envs
 from helpers import equal, make_job, resumed, train_here
 from sauna.config.presets import ARMS
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
@@ -17,8 +17,8 @@ from sauna.system.errors import BadInput
 
 MASKED: dict[str, Any] = {"action_mask": True, "envs": 2, "hidden": "8"}
 SEVERAL = {"env_kwargs": '{"several": true}'}
-# The host's world raises at an action that is not valid; the device's says so in its `info`.
-PLACES = {"host": ("worlds:Choosy", SEVERAL), "device": ("jax_worlds:choosy", {})}
+# The host's environment raises at an action that is not valid; the device's says so in its `info`.
+PLACES = {"host": ("small_envs:Choosy", SEVERAL), "device": ("jax_envs:choosy", {})}
 
 
 @pytest.mark.parametrize("place", ["host", pytest.param("device", marks=pytest.mark.slow)])
@@ -35,26 +35,26 @@ def test_a_resumed_run_took_valid_actions_alone_and_is_the_same_to_the_byte(plac
 
 
 @pytest.mark.slow
-def test_without_masks_the_same_world_sees_invalid_actions() -> None:
-    rows = train_here(make_job("jax_worlds:choosy", envs=2, hidden="8")).rows
+def test_without_masks_the_same_env_sees_invalid_actions() -> None:
+    rows = train_here(make_job("jax_envs:choosy", envs=2, hidden="8")).rows
     assert any(row.get("info_invalid", 0.0) > 0.5 for row in rows)
 
 
-def test_a_world_that_raises_at_invalid_actions_is_refused_without_masks() -> None:
+def test_an_env_that_raises_at_invalid_actions_is_refused_without_masks() -> None:
     with pytest.raises(BadInput, match="is not valid"):
-        make_job("worlds:Choosy", envs=2, **SEVERAL)
+        make_job("small_envs:Choosy", envs=2, **SEVERAL)
 
 
 @pytest.mark.slow
 def test_a_mask_without_a_valid_action_ends_training_on_the_device_with_a_reason() -> None:
     with pytest.raises(EnvironmentFailure, match=r"step 2 .* leaves no valid action"):
-        train_here(make_job("jax_worlds:stuck", **MASKED))
+        train_here(make_job("jax_envs:stuck", **MASKED))
 
 
 def test_a_loaded_policy_needs_the_mask_and_follows_it(tmp_path: Path) -> None:
     settings = {**MASKED, "steps": 128, "rollout_steps": 32, "quiet": True}
     run = tmp_path / "run"
-    sauna.train(worlds.Choosy, env_kwargs={"by": "method"}, out=run, **settings)
+    sauna.train(small_envs.Choosy, env_kwargs={"by": "method"}, out=run, **settings)
     policy = sauna.load(run)
     seen = np.zeros((4, 3), np.float32)
     masks = np.eye(5, dtype=bool)[[3, 0, 4, 2]]

@@ -9,16 +9,16 @@ from helpers import make_job, train_here
 
 NETWORKS = {
     "mlp": {
-        "env": "worlds:Scripted",
+        "env": "small_envs:Scripted",
         "hidden": "6",
         "value_hidden": "5,4",
         "activation": "elu",
         "layer_norm": "yes",
         "stack": 2,
     },
-    "small-cnn": {"env": "worlds:Board", "network": "small-cnn"},
-    "impala-cnn": {"env": "worlds:Board", "network": "impala-cnn", "trunk": "shared"},
-    "rows together": {"env": "vector_worlds:same", "hidden": "6", "dropped": "mask"},
+    "small-cnn": {"env": "small_envs:Board", "network": "small-cnn"},
+    "impala-cnn": {"env": "small_envs:Board", "network": "impala-cnn", "trunk": "shared"},
+    "rows together": {"env": "vector_envs:same", "hidden": "6", "dropped": "mask"},
 }
 # Those whose interface to a network differs: a filter, the head's gradient, a head of its own,
 # values anew, a weight of the loss.

@@ -29,10 +29,10 @@ def test_a_known_environment_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     "env, kwargs, preset, why",
     [
-        ("worlds:Scripted", {}, "mujoco", "its actions are continuous"),
-        ("worlds:GoodAction", {}, "discrete", "its actions are discrete"),
-        ("worlds:Picture", {}, "pictures", "it is seen in pictures"),
-        ("worlds:Board", {}, "discrete", "its actions are discrete"),
+        ("small_envs:Scripted", {}, "mujoco", "its actions are continuous"),
+        ("small_envs:GoodAction", {}, "discrete", "its actions are discrete"),
+        ("small_envs:Picture", {}, "pictures", "it is seen in pictures"),
+        ("small_envs:Board", {}, "discrete", "its actions are discrete"),
         ("Taxi-v4", {"max_episode_steps": 2000}, "long-horizon", "last up to 2,000 steps"),
     ],
 )
@@ -53,14 +53,14 @@ def test_what_names_its_settings_is_left_alone(monkeypatch: pytest.MonkeyPatch) 
         {},
     ):
         assert pick(given) == module.Picked(given)
-    several = {"env": "worlds:Scripted", "distributed": "localhost:1,2,0"}
+    several = {"env": "small_envs:Scripted", "distributed": "localhost:1,2,0"}
     assert pick(several) == module.Picked({**several, "preset": "mujoco"})
 
 
 def test_a_mistake_is_found_before_the_environment_is_made() -> None:
     for wrong, said in (
-        ({"env": "worlds:Raising", "gama": 1}, "unknown key 'gama'"),
-        ({"env": "worlds:Raising", "arm": "suana"}, "did you mean 'sauna'"),
+        ({"env": "small_envs:Raising", "gama": 1}, "unknown key 'gama'"),
+        ({"env": "small_envs:Raising", "arm": "suana"}, "did you mean 'sauna'"),
         ({"env": "nowhere:it"}, "cannot import 'nowhere'"),
     ):
         with pytest.raises(BadInput, match=said):

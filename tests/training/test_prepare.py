@@ -14,11 +14,11 @@ from sauna.training.prepare import examine, place, prepare
 from sauna.training.run import disk_errors, resume_command
 from sauna.training.worker import read_job, write_job
 
-WORLD = "worlds:Scripted"
+ENV = "small_envs:Scripted"
 
 
 def test_all_arms_have_what_the_environment_and_the_machine_decided() -> None:
-    prepared = prepare({"env": "worlds:Picture", "arm": "ppo,sauna", "seeds": "4,9"})
+    prepared = prepare({"env": "small_envs:Picture", "arm": "ppo,sauna", "seeds": "4,9"})
     assert [member.name for member in prepared.members] == ["ppo/4", "ppo/9", "sauna/4", "sauna/9"]
     for config in (prepared.config, *(member.config for member in prepared.members)):
         assert (config.network, config.normalize_observations) == ("nature-cnn", False)
@@ -29,7 +29,7 @@ def test_all_arms_have_what_the_environment_and_the_machine_decided() -> None:
 
 
 def test_a_worker_gets_the_members_that_the_run_has() -> None:
-    prepared = prepare({"env": WORLD, "arm": "ppo,vex-head", "seeds": 2, "vex_coef": 0.7})
+    prepared = prepare({"env": ENV, "arm": "ppo,vex-head", "seeds": 2, "vex_coef": 0.7})
     header = write_job(prepared.run, prepared.spaces, [1, 2], 3, True, False)
     job = read_job(header, {})
     assert job == prepared.job([1, 2], start=3)
@@ -37,9 +37,9 @@ def test_a_worker_gets_the_members_that_the_run_has() -> None:
 
 
 def test_what_is_known_of_an_environment_is_not_asked_again(monkeypatch) -> None:
-    spaces = prepare({"env": WORLD}).spaces
+    spaces = prepare({"env": ENV}).spaces
     monkeypatch.setattr("sauna.training.prepare.look_at", None)
-    overrides = {"env": WORLD, "arm": "ppo", "log_std_init": 0.5}
+    overrides = {"env": ENV, "arm": "ppo", "log_std_init": 0.5}
     found = Probe(spaces, "reward")
     assert examine(place(resolve_run(overrides)), overrides, found).differs == "reward"
     discrete = Probe(spaces._replace(action_kind="discrete"), None)

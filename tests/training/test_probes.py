@@ -15,7 +15,7 @@ SEEDS = 2
 GAMMA = 0.8
 
 
-def learn(world: str, arm: str, **settings: Any) -> Any:
+def learn(env: str, arm: str, **settings: Any) -> Any:
     """Trains both seeds; a function from observations to each seed's network output."""
     given = {
         "rollout_steps": 64,
@@ -32,7 +32,7 @@ def learn(world: str, arm: str, **settings: Any) -> Any:
         "clip_value": False,
         **settings,
     }
-    job = make_job(f"worlds:{world}", arm=arm, **given)
+    job = make_job(f"small_envs:{env}", arm=arm, **given)
     recorder = train_here(job)
 
     def outputs(observations: list[float]) -> list[Any]:

@@ -22,12 +22,12 @@ from sauna.experiments.inspect.streams import stream_of
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
 from sauna.training.artifact import load_artifact
-from worlds import Scripted
+from small_envs import Scripted
 
 slow = pytest.mark.slow
 CELL = {"recurrent": "gru", "recurrent_width": 6, "sequence_length": 8}
 PLACES = {"host": {}, "device": {"backend": "device"}}
-ENVS = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}
+ENVS = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}
 
 
 def job_of(place: str, arm: str = "sauna", **settings: Any) -> Any:
@@ -123,7 +123,7 @@ def test_what_cannot_work_is_refused_in_one_line() -> None:
 def frozen(seed: int = 0) -> tuple[FrozenPolicy, Any]:
     env = Scripted()
     spaces = describe(env.observation_space, env.action_space)
-    config = resolve({"env": "worlds:Scripted", "arm": "ppo", "hidden": "4", **CELL})
+    config = resolve({"env": "small_envs:Scripted", "arm": "ppo", "hidden": "4", **CELL})
     config = dataclasses.replace(config, network="mlp", normalize_observations=False)
     policy = FrozenPolicy(config, spaces, env)
     params = np.asarray(jax.jit(policy.policy.init)(jax.random.key(seed)))
@@ -160,7 +160,7 @@ def trained(folder: Path, arm: str) -> Path:
     settings = {**SMALL, **CELL, "arm": arm, "processes": 1, "eval_every": 64}
     if "sauna" in arm:
         settings["threshold"] = 0.9
-    return sauna.train("worlds:Drawn", quiet=True, out=folder / "run", **settings).path
+    return sauna.train("small_envs:Drawn", quiet=True, out=folder / "run", **settings).path
 
 
 @pytest.fixture(scope="module")

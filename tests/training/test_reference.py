@@ -25,7 +25,7 @@ from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.training.loop.budget import hypers_now, step_limit
 from sauna.training.loop.member_state import Counters
-from worlds import Scripted
+from small_envs import Scripted
 
 T, N = 24, 2
 
@@ -149,7 +149,7 @@ class Setup:
 
     def __init__(self, arm: str, **settings) -> None:
         job = make_job(
-            "worlds:Scripted",
+            "small_envs:Scripted",
             arm=arm,
             seeds="3,",
             envs=N,
@@ -176,8 +176,8 @@ class Setup:
         return collected, self.learner.make_batch(collected.rollout, self.hypers, no_key())
 
     def act(self, seen, noise):
-        action = np.asarray(self.program.act(self.params[None], seen[None], noise[None]))[0]
-        scores = np.asarray(self.program.score(self.params, seen[None], action[None]))[0]
+        found = self.program.act(self.params[None], seen[None], noise[None])
+        action, scores = (np.asarray(x)[0] for x in found)
         return action, *scores.T
 
     def value(self, seen):

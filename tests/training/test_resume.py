@@ -19,9 +19,9 @@ from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
 from sauna.training.display import make_display
-from worlds import Scripted
+from small_envs import Scripted
 
-WORLD = "worlds:Scripted"
+ENV = "small_envs:Scripted"
 
 
 @pytest.mark.parametrize("stops", [(1, 4, 7), pytest.param((2, 3, 5, 6), marks=pytest.mark.slow)])
@@ -34,7 +34,7 @@ WORLD = "worlds:Scripted"
     ],
 )
 def test_interrupted_after_any_iteration(stops: tuple[int, ...], settings) -> None:
-    job = make_job(WORLD, envs=2, steps=512, **settings)
+    job = make_job(ENV, envs=2, steps=512, **settings)
     whole = train_here(job)
     for stop in stops:
         first = train_here(job, stop)
@@ -54,13 +54,13 @@ MOVED = {
 }
 
 
-ON_DEVICE = {"env": "jax_worlds:walk", "backend": "device", "devices": 1}
+ON_DEVICE = {"env": "jax_envs:walk", "backend": "device", "devices": 1}
 
 
-@pytest.mark.parametrize("world", [{"env": WORLD}, pytest.param(ON_DEVICE, marks=pytest.mark.slow)])
-def test_what_moves_during_training_resumes_exactly(world: dict[str, Any]) -> None:
+@pytest.mark.parametrize("env", [{"env": ENV}, pytest.param(ON_DEVICE, marks=pytest.mark.slow)])
+def test_what_moves_during_training_resumes_exactly(env: dict[str, Any]) -> None:
     """A rate that follows the KL, two schedules, an optimizer of optax; on host and device."""
-    job = make_job(envs=2, steps=512, checkpoint_every=3, **world, **MOVED)
+    job = make_job(envs=2, steps=512, checkpoint_every=3, **env, **MOVED)
     whole = train_here(job)
     second = train_here(job._replace(restored=whole.states[3], start=3))
     assert equal(second.final, whole.final)
@@ -83,7 +83,7 @@ def test_resuming_a_complete_run_does_nothing(tmp_path: Path, capsys) -> None:
 
 def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, capsys) -> None:
     run = tmp_path / "run"
-    sauna.train("worlds:Forgetful", out=run, arm="sauna", **SMALL)
+    sauna.train("small_envs:Forgetful", out=run, arm="sauna", **SMALL)
     said = capsys.readouterr().out
     assert "does not repeat itself" in said and "not resumed exactly" in said
     assert said.index("does not repeat") < said.index("writing to")
@@ -93,7 +93,7 @@ def test_an_environment_that_cannot_be_restored_says_so_at_the_start(tmp_path, c
 def test_a_run_of_such_an_environment_goes_on_with_new_episodes(tmp_path, capsys) -> None:
     run = tmp_path / "run"
     sauna.train(
-        "worlds:Forgetful",
+        "small_envs:Forgetful",
         out=run,
         quiet=True,
         checkpoint_every=2,
@@ -120,7 +120,7 @@ def make_incomplete(run: Path, iteration: int) -> None:
 def finished(tmp_path: Path, **settings) -> Path:
     run = tmp_path / "run"
     sauna.train(
-        WORLD,
+        ENV,
         out=run,
         quiet=True,
         checkpoint_every=2,
@@ -239,9 +239,9 @@ def test_a_checkpoint_of_another_run_or_environment_is_refused(tmp_path) -> None
     with pytest.raises(BadInput, match=r"gamma is 0.99, not 0.5"):
         sauna.resume(run, quiet=True)
     stored["config"]["gamma"] = 0.99
-    stored["config"]["env"] = "worlds:Endless"
+    stored["config"]["env"] = "small_envs:Endless"
     path.write_text(json.dumps(stored))
-    with pytest.raises(BadInput, match=r"names code .* env 'worlds:Endless'"):
+    with pytest.raises(BadInput, match=r"names code .* env 'small_envs:Endless'"):
         sauna.resume(run, quiet=True)
     with pytest.raises(BadInput, match="other spaces"):
         sauna.resume(run, quiet=True, trust=True)

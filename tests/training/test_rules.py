@@ -39,7 +39,7 @@ def marked(names: Any) -> list[Any]:
 @pytest.mark.parametrize("place", ["device", pytest.param("host", marks=slow)])
 def test_an_arm_trains_and_its_work_is_told(arm: str, place: str) -> None:
     """Two epochs of four minibatches of 16 rows; no rule takes more rows than there are."""
-    env = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}[place]
+    env = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}[place]
     job = make_job(env, arm=arm, **({"backend": "device"} if place == "device" else {}), **WALK)
     recorder = train_here(job)
     assert len(recorder.rows) >= (2 if "sauna" in arm else 8)
@@ -82,7 +82,7 @@ def test_a_control_keeps_as_many_steps_of_each_env_as_its_rule(
         return chosen
 
     monkeypatch.setattr("sauna.algorithm.learner.samples.controlled_filter", recorded)
-    env = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}[place]
+    env = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}[place]
     settings = {"arm": "sauna+random", "threshold": 0.9, "dropped": dropped, **WALK}
     job = make_job(env, **settings, **({"backend": "device"} if place == "device" else {}))
     rows = train_here(job).rows
@@ -99,7 +99,7 @@ def test_a_control_keeps_as_many_steps_of_each_env_as_its_rule(
 @pytest.mark.parametrize("place", ["host", pytest.param("device", marks=slow)])
 @pytest.mark.parametrize("arm", marked(STATEFUL))
 def test_a_rules_state_is_resumed_to_the_same_bytes(arm: str, place: str) -> None:
-    env = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}[place]
+    env = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}[place]
     job = make_job(env, arm=arm, **({"backend": "device"} if place == "device" else {}), **WALK)
     whole, first = train_here(job), train_here(job, 3)
     again = train_here(resumed(job, first))

@@ -38,11 +38,11 @@ from sauna.training.loop.member_state import named_optimizer, unpack_optimizer
 from sauna.training.worker import train_members
 
 VECTOR = Spaces("vector", (3,), "continuous", (2,), "", "")
-WORLD = "worlds:Scripted"
+ENV = "small_envs:Scripted"
 PUBLISHED = {"algorithm": "a2c", "rollout_steps": 5, "envs": 16}
 
 
-def job_of(arm: str, env: str = WORLD, iterations: int = 6, **settings: Any) -> Any:
+def job_of(arm: str, env: str = ENV, iterations: int = 6, **settings: Any) -> Any:
     """A short job at the published 5 steps x 16 environments."""
     given = {**PUBLISHED, "arm": arm, "steps": 80 * iterations, **settings}
     return make_job(env, **given)
@@ -283,7 +283,7 @@ def test_off_means_off_and_a_member_depends_on_its_own_seed_alone() -> None:
 @pytest.mark.slow
 def test_inside_the_compiled_program() -> None:
     """On the device: off means off, and a resumed run ends with the same bytes."""
-    walk = "jax_worlds:walk"
+    walk = "jax_envs:walk"
     plain = train_here(job_of("ppo", walk)).final
     off = train_here(job_of("sauna", walk, threshold=0.0, vex_coef=0.0)).final
     assert equal(own(plain, "ppo/0"), own(off, "sauna/0"))

@@ -148,9 +148,9 @@ def test_a_sampler_chooses_from_the_pool() -> None:
 @pytest.mark.parametrize(
     "where",
     [
-        {"env": "worlds:Scripted"},
+        {"env": "small_envs:Scripted"},
         pytest.param(
-            {"env": "jax_worlds:walk", "backend": "device", "devices": 1}, marks=pytest.mark.slow
+            {"env": "jax_envs:walk", "backend": "device", "devices": 1}, marks=pytest.mark.slow
         ),
     ],
 )

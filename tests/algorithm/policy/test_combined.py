@@ -70,7 +70,7 @@ def test_numbers_alone_are_normalized_and_the_head_reads_hidden() -> None:
         make_job("sauna.envs.small:Signpost", arm="ppo", hidden="7", **alone)
 
 
-def test_the_small_worlds_are_solved_by_what_they_say() -> None:
+def test_the_small_envs_are_solved_by_what_they_say() -> None:
     """The corner that is bright, so many corners further on."""
     env = Signpost()
     observation, _ = env.reset(seed=3)

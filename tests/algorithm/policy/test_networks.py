@@ -208,6 +208,8 @@ def test_convolutions_are_xlas(pictures: int) -> None:
     for one, other in zip(ours, expected, strict=True):
         scale = np.abs(other).max()
         np.testing.assert_allclose(one / scale, other / scale, rtol=1e-4, atol=1e-5)
+    without_gradient = np.asarray(jax.jit(convolutions)(layers, x))
+    np.testing.assert_allclose(without_gradient, ours[-1], rtol=1e-4, atol=1e-4)
 
 
 def test_the_gradient_of_bytes_is_that_of_their_shares() -> None:
@@ -235,7 +237,7 @@ def test_named_parameters_go_round() -> None:
 
 @pytest.mark.parametrize("trunk", ["separate", "shared"])
 def test_a_users_own_module_trains(trunk: str) -> None:
-    job = make_job("worlds:Scripted", network="trunks:Sine", trunk=trunk)
+    job = make_job("small_envs:Scripted", network="trunks:Sine", trunk=trunk)
     final = train_here(job).final
     part = "trunk" if trunk == "shared" else "policy_trunk"
     assert final[f"sauna/0/params/{part}/inner/kernel"].shape == (3, 7)
@@ -249,7 +251,7 @@ def test_something_else_than_a_module_is_refused() -> None:
 
 def test_images_train_end_to_end() -> None:
     job = make_job(
-        "worlds:Picture",
+        "small_envs:Picture",
         arm="vex-head",
         network="nature-cnn",
         rollout_steps=8,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from helpers import SMALL, TESTS, Recorder, equal, make_job, own, resumed, train_here
-from jax_worlds import LENGTH, walk
+from jax_envs import LENGTH, walk
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.rollout.device import WINDOW, Collecting, _ends, _Row, collect, start
 from sauna.algorithm.rollout.host import HostCollector
@@ -102,7 +102,7 @@ ARMS = [
 
 @pytest.mark.parametrize("arm, settings", ARMS)
 def test_host_and_device_fill_the_same_rollout(arm: str, settings: dict[str, Any]) -> None:
-    job = make_job("jax_worlds:walk", arm=arm, envs=N, **settings)
+    job = make_job("jax_envs:walk", arm=arm, envs=N, **settings)
     config, keys = job.config, member_keys(7)
     program = make_program(config, job.spaces)
     params = program.policy.init(keys.init)
@@ -208,7 +208,7 @@ def test_cached_resets_return_to_the_first_state_and_fresh_ones_do_not() -> None
 
 
 def device_job(**settings: Any) -> Any:
-    return make_job("jax_worlds:walk", arm="sauna", envs=2, threshold=0.9, steps=512, **settings)
+    return make_job("jax_envs:walk", arm="sauna", envs=2, threshold=0.9, steps=512, **settings)
 
 
 def test_a_member_does_not_depend_on_its_neighbours() -> None:
@@ -245,7 +245,7 @@ def test_resume_is_exact(reset: str) -> None:
 
 @slow
 def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted() -> None:
-    job = make_job("jax_worlds:walk", arm="sauna", envs=3, steps=1000, seeds=2, threshold=0.9)
+    job = make_job("jax_envs:walk", arm="sauna", envs=3, steps=1000, seeds=2, threshold=0.9)
     rows = train_here(job).rows
     for seed in (0, 1):
         mine = [row for row in rows if row["seed"] == seed]
@@ -257,11 +257,11 @@ def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted() -> None:
 
 @pytest.mark.slow
 def test_the_learning_rate_and_the_threshold_follow_their_schedules() -> None:
-    job = make_job("jax_worlds:walk", arm="ppo", learning_rate=0.5)
+    job = make_job("jax_envs:walk", arm="ppo", learning_rate=0.5)
     rows = train_here(job).rows
     np.testing.assert_allclose([r["learning_rate"] for r in rows], [0.5, 0.375, 0.25, 0.125])
     schedule = {"threshold": 0.8, "threshold_schedule": "falling"}
-    rows = train_here(make_job("jax_worlds:walk", arm="sauna", **schedule)).rows
+    rows = train_here(make_job("jax_envs:walk", arm="sauna", **schedule)).rows
     before = np.array([0, *(row["env_steps"] for row in rows[:-1])])
     np.testing.assert_allclose([r["threshold"] for r in rows], 0.8 * (1 - before / 128), rtol=1e-5)
 
@@ -282,7 +282,7 @@ def test_a_truncated_episode_bootstraps_and_a_wrong_one_would_not() -> None:
     }
     found = {}
     for truncation in ("bootstrap", "terminate"):
-        job = make_job("jax_worlds:cut_off", arm="ppo", truncation=truncation, **settings)
+        job = make_job("jax_envs:cut_off", arm="ppo", truncation=truncation, **settings)
         recorder = train_here(job)
         from helpers import policy_output
 
@@ -295,13 +295,13 @@ def test_a_truncated_episode_bootstraps_and_a_wrong_one_would_not() -> None:
 
 @pytest.mark.slow
 def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
-    job = make_job("jax_worlds:broken", arm="ppo", envs=2)
+    job = make_job("jax_envs:broken", arm="ppo", envs=2)
     with pytest.raises(EnvironmentFailure, match=r"environment 0 .* step 4 .* reward"):
         train_here(job)
-    job = make_job("jax_worlds:broken_start", arm="ppo", envs=2)
+    job = make_job("jax_envs:broken_start", arm="ppo", envs=2)
     with pytest.raises(EnvironmentFailure, match=r"step 0 .* observation"):
         train_here(job)
-    job = make_job("jax_worlds:walk", arm="ppo", envs=2, learning_rate=1e30)
+    job = make_job("jax_envs:walk", arm="ppo", envs=2, learning_rate=1e30)
     with pytest.raises(NonFinite, match="ppo/0"):
         train_here(job)
 
@@ -309,13 +309,13 @@ def test_a_number_that_is_not_finite_stops_the_run_and_is_named() -> None:
 @pytest.mark.parametrize(
     "settings, message",
     [
-        ({"env": "jax_worlds:no_env", "backend": "device"}, "not a sauna.JaxEnv"),
+        ({"env": "jax_envs:no_env", "backend": "device"}, "not a sauna.JaxEnv"),
         ({"env": "InvertedPendulum-v5", "backend": "device"}, "does not run on the device"),
-        ({"env": "jax_worlds:walk", "env_processes": 1}, "env_processes: not read"),
+        ({"env": "jax_envs:walk", "env_processes": 1}, "env_processes: not read"),
         ({"env": "InvertedPendulum-v5", "reset": "cached"}, "reset: only read"),
         ({"env": "gymnax/CartPol-v1"}, "CartPole-v1"),
-        ({"env": "jax_worlds:walk", "device": "gpu"}, "device: no NVIDIA GPU"),
-        ({"env": "jax_worlds:walk", "steps": 3_000_000_000}, "steps: the device counts"),
+        ({"env": "jax_envs:walk", "device": "gpu"}, "device: no NVIDIA GPU"),
+        ({"env": "jax_envs:walk", "steps": 3_000_000_000}, "steps: the device counts"),
     ],
 )
 def test_bad_input_is_refused(

@@ -15,7 +15,14 @@ from sauna.algorithm.policy.normalize import (
     scale_rewards,
     update_moments,
 )
+from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.rollout.moments import ObservationMoments
+from sauna.algorithm.rollout.program import make_program
+from sauna.algorithm.types import member_keys
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.training.loop.budget import hypers_now
+from sauna.training.loop.member_state import Counters
+from small_envs import Board
 
 
 @pytest.mark.parametrize(
@@ -29,7 +36,7 @@ from sauna.algorithm.rollout.moments import ObservationMoments
     ],
 )
 def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted(arm: str, settings) -> None:
-    job = make_job("worlds:Scripted", arm=arm, envs=3, steps=1000, seeds=2, **settings)
+    job = make_job("small_envs:Scripted", arm=arm, envs=3, steps=1000, seeds=2, **settings)
     rows = train_here(job).rows
     for seed in (0, 1):
         own = [row for row in rows if row["seed"] == seed]
@@ -43,17 +50,41 @@ def test_no_arm_oversteps_the_budget_and_every_env_step_is_counted(arm: str, set
 
 
 def test_a_budget_of_kept_steps_acts_more_often() -> None:
-    job = make_job("worlds:Scripted", arm="sauna-reference", threshold=0.6, steps=320, seeds=1)
+    job = make_job("small_envs:Scripted", arm="sauna-reference", threshold=0.6, steps=320, seeds=1)
     last = train_here(job).rows[-1]
     assert last["kept_steps"] == 320 < last["env_steps"]
 
 
 def test_the_learning_rate_falls_linearly_with_env_steps_or_not_at_all() -> None:
-    rows = train_here(make_job("worlds:Scripted", arm="ppo", learning_rate=0.5)).rows
+    rows = train_here(make_job("small_envs:Scripted", arm="ppo", learning_rate=0.5)).rows
     np.testing.assert_allclose([r["learning_rate"] for r in rows], [0.5, 0.375, 0.25, 0.125])
     settings = {"learning_rate": 0.5, "preset": "mujoco-release"}
-    rows = train_here(make_job("worlds:Scripted", arm="ppo", **settings)).rows
+    rows = train_here(make_job("small_envs:Scripted", arm="ppo", **settings)).rows
     assert {r["learning_rate"] for r in rows} == {0.5}
+
+
+@pytest.mark.parametrize("arm", ["ppo", "sauna"])
+def test_scores_given_while_acting_are_those_of_the_whole_rollout(arm: str) -> None:
+    """A CNN gives log-probability, value and Vex with its actions; of each member its own."""
+    job = make_job(
+        "small_envs:Board", network="small-cnn", arm=arm, seeds=2, envs=3, rollout_steps=8
+    )
+    program, keys = make_program(job.config, job.spaces), [member_keys(seed) for seed in (0, 1)]
+    envs = GymnasiumEnvs(Board, [(seed, n) for seed in (0, 1) for n in range(3)])
+    collector = HostCollector(program, job.spaces, envs, keys)
+    collector.start()
+    params = np.stack([program.policy.init(key.init) for key in keys])
+    hypers = [hypers_now(member.config, Counters()) for member in job.members]
+    found = collector.collect(params, hypers, 0, np.array([8, 8]))
+    for vector, other, one in zip(params, params[::-1], found, strict=True):
+        rollout = one.rollout
+        scores = np.stack([rollout.log_prob, rollout.value, rollout.vex], -1)[:8]
+        expected, another = (
+            np.asarray(program.score(p, rollout.observation[:8], rollout.action[:8]))
+            for p in (vector, other)
+        )
+        np.testing.assert_allclose(scores, expected, rtol=1e-5, atol=1e-6)
+        assert np.abs(scores - another).max() > 1e-3
 
 
 def test_moments_equal_baselines_and_skip_inactive_rows() -> None:

@@ -259,7 +259,7 @@ def test_a_schedule_follows_the_env_steps() -> None:
 
 
 def test_a_held_rate_is_held_resumed_exactly_and_leaves_ppo_beside_it_alone() -> None:
-    common = {"env": "worlds:Scripted", "steps": 512, "rollout_steps": 64, "envs": 2}
+    common = {"env": "small_envs:Scripted", "steps": 512, "rollout_steps": 64, "envs": 2}
     job = make_job(arm="ppo,sauna", keep_rate_target=0.5, **common)
     whole, first = train_here(job), train_here(job, 2)
     rest = train_here(resumed(job, first))

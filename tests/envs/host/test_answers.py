@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import worlds
+import small_envs
 from sauna.envs.host.answers import close, first_of, five_of, life_lost, one_number, reset_with
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
@@ -51,7 +51,7 @@ def test_info_says_that_a_life_was_lost_or_nothing() -> None:
 
 
 def playing(**settings: Any) -> GymnasiumEnvs:
-    return GymnasiumEnvs(lambda: worlds.Answering(**settings), [(0, 0)])
+    return GymnasiumEnvs(lambda: small_envs.Answering(**settings), [(0, 0)])
 
 
 def test_rewards_and_infos_reach_a_step() -> None:
@@ -65,37 +65,37 @@ def test_rewards_and_infos_reach_a_step() -> None:
         with pytest.raises(EnvironmentFailure, match=words):
             envs.step(ACTION, ALL)
         with pytest.raises(BadInput, match=words):
-            probe("worlds:Answering", wrong)
+            probe("small_envs:Answering", wrong)
 
 
 def test_a_simulator_with_a_signed_seed_is_reset_with_the_lower_bits() -> None:
     small, large = 7, 2**31 + 9
-    env = worlds.SignedSeed()
+    env = small_envs.SignedSeed()
     assert reset_with(env, small)[0] == small and reset_with(env, large)[0] == 9
-    assert reset_with(worlds.SignedSeed(error="OverflowError"), large)[0] == 9
+    assert reset_with(small_envs.SignedSeed(error="OverflowError"), large)[0] == 9
     with pytest.raises(ValueError, match="on fire"):  # has nothing to do with the seed
-        reset_with(worlds.SignedSeed(error="fire"), large)
+        reset_with(small_envs.SignedSeed(error="fire"), large)
 
 
 def test_other_environments_get_the_seed_as_it_is() -> None:
     numbers = [n for n in range(20) if episode_seed(0, 0, n) >= 2**31]
     assert numbers
     for n in numbers[:3]:
-        got = GymnasiumEnvs(worlds.Scripted, [(0, 0)]).start_after(
+        got = GymnasiumEnvs(small_envs.Scripted, [(0, 0)]).start_after(
             0, {"episode": np.asarray(n - 1)}
         )
-        expected, _ = worlds.Scripted().reset(seed=episode_seed(0, 0, n))
+        expected, _ = small_envs.Scripted().reset(seed=episode_seed(0, 0, n))
         np.testing.assert_array_equal(got, expected)
 
 
 def test_what_cannot_be_closed_is_said_and_costs_nothing(capsys) -> None:
     for error in ("RuntimeError", "SystemExit"):
-        close(worlds.Unclosable(error), "environment 0")
+        close(small_envs.Unclosable(error), "environment 0")
         said = capsys.readouterr().err
         assert said.startswith("warning: environment 0 cannot be closed: ") and error in said
-    probe("worlds:Unclosable", {})
+    probe("small_envs:Unclosable", {})
 
 
 def test_a_step_that_fails_is_not_hidden_by_close() -> None:
     with pytest.raises(BadInput, match="cannot be played: ValueError: the motor is on fire"):
-        probe("worlds:Unclosable", {"raises": True})
+        probe("small_envs:Unclosable", {"raises": True})

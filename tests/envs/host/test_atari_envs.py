@@ -212,7 +212,7 @@ def test_a_time_limit_shows_what_was_reached() -> None:
 def test_a_lost_life_ends_what_is_learned_and_not_what_is_told() -> None:
     """Three lives of two steps, rewards 5 and -3; a rollout of 12 steps is two games."""
     job = make_job(
-        "worlds:Lives",
+        "small_envs:Lives",
         arm="ppo",
         rollout_steps=12,
         minibatches=1,

@@ -17,7 +17,7 @@ from sauna.envs.probe import probe
 from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.envs.workers import ProcessEnvs
 from sauna.system.errors import BadInput
-from worlds import Scripted, Spaced
+from small_envs import Scripted, Spaced
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
 Make = Callable[..., HostEnvs]
@@ -42,7 +42,7 @@ def actions(number: int, seed: int = 0) -> np.ndarray:
 def test_steps_are_the_environments_own(make: Make) -> None:
     """Against plain Gymnasium loops: observations, rewards, both kinds of end, final
     observations, and the seeds of the episodes."""
-    envs, plain = make("worlds:Scripted", {}), [Scripted() for _ in SEEDS]
+    envs, plain = make("small_envs:Scripted", {}), [Scripted() for _ in SEEDS]
     episodes = [0] * len(SEEDS)
     expected = [e.reset(seed=episode_seed(*s, 0))[0] for e, s in zip(plain, SEEDS, strict=True)]
     np.testing.assert_array_equal(envs.reset(), expected)
@@ -69,7 +69,7 @@ def test_steps_are_the_environments_own(make: Make) -> None:
 
 @backends
 def test_inactive_environments_stand_still(make: Make) -> None:
-    envs, other = make("worlds:Scripted", {}), in_process("worlds:Scripted", {})
+    envs, other = make("small_envs:Scripted", {}), in_process("small_envs:Scripted", {})
     before = envs.reset()
     other.reset()
     everyone, two = np.ones(3, bool), np.array([True, False, True])
@@ -84,7 +84,7 @@ def test_inactive_environments_stand_still(make: Make) -> None:
 @backends
 def test_a_restored_environment_goes_on_bit_for_bit(make: Make) -> None:
     everyone = np.ones(3, bool)
-    envs, again = make("worlds:Scripted", {}), make("worlds:Scripted", {})
+    envs, again = make("small_envs:Scripted", {}), make("small_envs:Scripted", {})
     envs.reset()
     again.reset()
     for row in actions(37):
@@ -134,7 +134,7 @@ def test_every_supported_space(make: Make, observation: str, action: str) -> Non
     """The environment itself asserts that each action belongs to its space."""
     if make is in_workers and (observation, action) != ("dict", "multi_discrete"):
         pytest.skip("one combination is enough to cover the worker's conversions")
-    envs = make("worlds:Spaced", {"observation": observation, "action": action})
+    envs = make("small_envs:Spaced", {"observation": observation, "action": action})
     spaces = envs.spaces  # type: ignore[attr-defined]
     assert envs.reset().shape == (3, *spaces.observation_shape)
     rng = np.random.default_rng(0)
@@ -149,11 +149,11 @@ def test_every_supported_space(make: Make, observation: str, action: str) -> Non
 
 
 def test_conversions_by_hand() -> None:
-    world = Spaced("dict", "multi_discrete")
-    read = observation_reader(world.observation_space)
+    spaced = Spaced("dict", "multi_discrete")
+    read = observation_reader(spaced.observation_space)
     seen = read({"a": np.array([0.25, 0.5], np.float32), "b": 2})
     np.testing.assert_allclose(seen, [0.25, 0.5, 0, 0, 1])
-    write = action_writer(world.action_space)
+    write = action_writer(spaced.action_space)
     np.testing.assert_array_equal(write(np.array([1, 2], np.int32)), [2, 6])
     assert action_writer(Spaced("box", "discrete").action_space)(np.array([0])) == -1
     read = observation_reader(gymnasium.spaces.Box(0, 255, (2, 40, 50), np.uint8))
@@ -167,21 +167,21 @@ def test_conversions_by_hand() -> None:
 @pytest.mark.parametrize("kwargs", [{"observation": "text"}, {"action": "tuple"}])
 def test_unsupported_spaces_are_named(kwargs: dict) -> None:
     with pytest.raises(BadInput, match="not supported"):
-        probe("worlds:Spaced", kwargs)
+        probe("small_envs:Spaced", kwargs)
 
 
 def test_the_probe_sees_what_does_not_repeat() -> None:
-    assert probe("worlds:Scripted", {}).differs is None
+    assert probe("small_envs:Scripted", {}).differs is None
     assert probe("Hopper-v5", {}).differs is None
-    assert "observations differ" in str(probe("worlds:Forgetful", {}).differs)
-    assert "observations differ" in str(probe("worlds:Lingering", {}).differs)
+    assert "observations differ" in str(probe("small_envs:Forgetful", {}).differs)
+    assert "observations differ" in str(probe("small_envs:Lingering", {}).differs)
 
 
 @pytest.mark.parametrize(
     "env, message",
     [
         ("NoSuch-v0", "unknown environment"),
-        ("worlds:NoSuch", "has no 'NoSuch'"),
+        ("small_envs:NoSuch", "has no 'NoSuch'"),
         ("nowhere:Scripted", "cannot import"),
         ("nowhere:Thing-v0", "cannot import"),
     ],
@@ -193,7 +193,7 @@ def test_environments_that_do_not_exist(env: str, message: str) -> None:
 
 def test_wrong_keywords_are_bad_input() -> None:
     with pytest.raises(BadInput, match="cannot be made"):
-        probe("worlds:Scripted", json.loads('{"speed": 3}'))
+        probe("small_envs:Scripted", json.loads('{"speed": 3}'))
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_pictures_follow_the_robot(env: str, kwargs: dict, camera: int) -> None:
 
 @backends
 def test_non_finite_numbers_are_refused_with_their_place(make: Make) -> None:
-    envs = make("worlds:NotANumber", {})
+    envs = make("small_envs:NotANumber", {})
     envs.reset()
     with pytest.raises(EnvironmentFailure, match=r"seed \d.*episode 2, step 1.*\[1\] is nan"):
         for row in actions(60):
@@ -221,7 +221,7 @@ def test_non_finite_numbers_are_refused_with_their_place(make: Make) -> None:
 @backends
 def test_an_observation_of_another_shape_is_not_stretched(make: Make) -> None:
     """One number would fill a row of three. The probe looks at the first episodes only."""
-    envs = make("worlds:Misshapen", {"first": 2})
+    envs = make("small_envs:Misshapen", {"first": 2})
     envs.reset()
     with pytest.raises(
         EnvironmentFailure, match=r"episode 2, step 0.*shape \(1,\) instead of \(3,"
@@ -233,7 +233,7 @@ def test_an_observation_of_another_shape_is_not_stretched(make: Make) -> None:
 
 @backends
 def test_an_exception_names_the_environment(make: Make) -> None:
-    envs = make("worlds:Raising", {})
+    envs = make("small_envs:Raising", {})
     envs.reset()
     with pytest.raises(EnvironmentFailure, match=r"environment 0 of seed 3.*on fire"):
         envs.step(actions(1)[0], np.ones(3, bool))
@@ -241,7 +241,7 @@ def test_an_exception_names_the_environment(make: Make) -> None:
 
 
 def test_a_dead_worker_is_named_with_its_exit_code() -> None:
-    envs = in_workers("worlds:Dying", {})
+    envs = in_workers("small_envs:Dying", {})
     envs.reset()
     with pytest.raises(EnvironmentFailure, match=r"worker 0 \(process \d+\) ended .* code 7"):
         envs.step(actions(1)[0], np.ones(3, bool))
@@ -249,7 +249,7 @@ def test_a_dead_worker_is_named_with_its_exit_code() -> None:
 
 
 def test_a_worker_killed_between_steps_is_named() -> None:
-    envs = in_workers("worlds:Scripted", {})
+    envs = in_workers("small_envs:Scripted", {})
     envs.reset()
     envs._workers[1].process.kill()  # type: ignore[attr-defined]
     envs._workers[1].process.wait()  # type: ignore[attr-defined]
@@ -261,7 +261,7 @@ def test_a_worker_killed_between_steps_is_named() -> None:
 @backends
 def test_an_episode_can_be_skipped(make: Make) -> None:
     """What an inexact resume does: the episode after the one of the snapshot."""
-    envs = make("worlds:Scripted", {})
+    envs = make("small_envs:Scripted", {})
     envs.reset()
     got = envs.start_after(1, {"episode": np.asarray(4), "actions": np.zeros((0, 2))})
     expected, _ = Scripted().reset(seed=episode_seed(3, 1, 5))
@@ -271,17 +271,17 @@ def test_an_episode_can_be_skipped(make: Make) -> None:
 
 def test_a_non_finite_first_observation_is_refused() -> None:
     with pytest.raises(EnvironmentFailure, match="episode 0, step 0"):
-        in_process("worlds:NotANumber", {"first": 1, "step": 0}).reset()
+        in_process("small_envs:NotANumber", {"first": 1, "step": 0}).reset()
 
 
 @pytest.mark.parametrize("kwargs", [{"broken": "reset"}, {"broken": "step"}])
 def test_an_environment_that_cannot_be_played_is_bad_input(kwargs: dict) -> None:
-    with pytest.raises(BadInput, match="worlds:Broken cannot be played: TypeError: two lines"):
-        probe("worlds:Broken", kwargs)
+    with pytest.raises(BadInput, match="small_envs:Broken cannot be played: TypeError: two lines"):
+        probe("small_envs:Broken", kwargs)
 
 
 def test_a_hung_worker_is_named_and_killed() -> None:
-    envs = ProcessEnvs("worlds:Hanging", {}, SEEDS, processes=1, timeout=20.0)
+    envs = ProcessEnvs("small_envs:Hanging", {}, SEEDS, processes=1, timeout=20.0)
     envs.reset()
     envs._timeout = 0.5
     with pytest.raises(EnvironmentFailure, match=r"did not answer within 0\.5 s"):

@@ -104,7 +104,7 @@ def test_a_restored_environment_goes_on_bit_for_bit(name: str) -> None:
 
 def test_what_the_fast_path_does_not_know_is_left_to_gymnasium() -> None:
     """A wrapper, a subclass or an older version may do something in `step` that would be lost."""
-    for name, kwargs in [("Hopper-v4", {}), ("CartPole-v1", {}), ("worlds:Scripted", {})]:
+    for name, kwargs in [("Hopper-v4", {}), ("CartPole-v1", {}), ("small_envs:Scripted", {})]:
         if name in gymnasium.registry or ":" in name:
             envs = in_process_envs(name, kwargs, SEEDS, "auto")
             assert type(envs) is GymnasiumEnvs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import vector_worlds
+import vector_envs
 from helpers import equal, make_job, resumed, train_here
 from sauna.algorithm.rollout.host import HostCollector
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
@@ -43,9 +43,9 @@ def streams(envs, actions: np.ndarray, steps: int) -> list[list[tuple]]:
 def test_every_autoreset_mode_gives_the_steps_of_single_environments(mode: str) -> None:
     """With the true final observation of each episode; two members of two rows each."""
     actions = np.random.default_rng(0).integers(0, 2, (4, 40)).astype(np.int32)
-    one_by_one = GymnasiumEnvs(vector_worlds.Counting, SEEDS)
+    one_by_one = GymnasiumEnvs(vector_envs.Counting, SEEDS)
     expected = streams(one_by_one, actions, 40)
-    envs = in_process_envs(f"vector_worlds:{mode}", {}, SEEDS, "auto")
+    envs = in_process_envs(f"vector_envs:{mode}", {}, SEEDS, "auto")
     assert isinstance(envs, VectorEnvs)
     for got, row in zip(streams(envs, actions, 40), expected, strict=True):
         assert got == row[: len(got)] and len(got) >= 30
@@ -58,7 +58,7 @@ def test_every_autoreset_mode_gives_the_steps_of_single_environments(mode: str) 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_vector_environment_of_one_row_is_a_plain_one(mode: str) -> None:
-    env = make_env(f"vector_worlds:{mode}", {})
+    env = make_env(f"vector_envs:{mode}", {})
     assert isinstance(env, OneRow)
     assert env.reset(seed=3)[0] == [0.0]
     for t in range(1, 6):
@@ -66,24 +66,24 @@ def test_a_vector_environment_of_one_row_is_a_plain_one(mode: str) -> None:
         assert (seen.tolist(), reward) == ([float(t)], 10.0 * (t - 1))
         assert (terminated, truncated, info["is_success"]) == (False, t == 5, float(t == 3))
     assert env.reset()[0] == [0.0]
-    found = probe(f"vector_worlds:{mode}", {})
+    found = probe(f"vector_envs:{mode}", {})
     assert found.group == 0 and "row by row" in str(found.differs)
 
 
 def test_a_vector_environment_that_cannot_be_used_is_refused_in_a_line() -> None:
     with pytest.raises(BadInput, match="2 rows instead of 3"):
-        in_process_envs("vector_worlds:two_always", {}, [(0, n) for n in range(3)], "auto")
+        in_process_envs("vector_envs:two_always", {}, [(0, n) for n in range(3)], "auto")
     with pytest.raises(BadInput, match="does not say how it begins episodes"):
-        make_env("vector_worlds:nameless", {})
+        make_env("vector_envs:nameless", {})
     for settings, words in (
-        ({"env_processes": 1}, "env_processes: not read by vector_worlds:same"),
+        ({"env_processes": 1}, "env_processes: not read by vector_envs:same"),
         ({"arm": "sauna"}, "dropped: --dropped replace needs"),
     ):
         with pytest.raises(BadInput, match=words):
-            make_job("vector_worlds:same", **{"arm": "ppo", **settings})
+            make_job("vector_envs:same", **{"arm": "ppo", **settings})
     with pytest.raises(BadInput, match=r"mode NEXT_STEP.*use mode SAME_STEP"):
-        make_job("vector_worlds:later", arm="sauna", dropped="mask")
-    make_job("vector_worlds:same", arm="sauna", dropped="mask")
+        make_job("vector_envs:later", arm="sauna", dropped="mask")
+    make_job("vector_envs:same", arm="sauna", dropped="mask")
     with pytest.raises(BadInput, match="Gymnasium knows no 'Nowhere-v0'"):
         make_env("make_vec/Nowhere-v0", {})
 
@@ -100,7 +100,7 @@ def test_void_steps_are_neither_learned_from_nor_counted(monkeypatch) -> None:
 
     monkeypatch.setattr(HostCollector, "collect", watched)
     settings = {"arm": "ppo", "envs": 2, "normalize_rewards": "no", "truncation": "bootstrap"}
-    recorder = train_here(make_job("vector_worlds:later", **settings, steps=192))
+    recorder = train_here(make_job("vector_envs:later", **settings, steps=192))
     counted = 0
     for (params, collector, (rollout,), (found,)), row in zip(kept, recorder.rows, strict=True):
         ended = rollout.terminated | rollout.truncated
@@ -123,7 +123,7 @@ def test_void_steps_are_neither_learned_from_nor_counted(monkeypatch) -> None:
 
 def test_agents_are_rows_and_one_that_leaves_waits_for_the_others() -> None:
     seeds = [(0, n) for n in range(6)]
-    envs = in_process_envs("vector_worlds:Agents", {}, seeds, "auto")
+    envs = in_process_envs("vector_envs:Agents", {}, seeds, "auto")
     assert isinstance(envs, ParallelEnvs)
     first = envs.reset()
     np.testing.assert_array_equal(first[:, 0], [0, 1, 2, 0, 1, 2])
@@ -140,7 +140,7 @@ def test_agents_are_rows_and_one_that_leaves_waits_for_the_others() -> None:
         assert sorted(step.info) == np.flatnonzero(ended).tolist()
     assert waiting == [[False] * 3, [False] * 3, [True, False, False], [True, True, False]]
     np.testing.assert_array_equal(envs.step(action, active).observation[:, 1], [1] * 6)
-    again = in_process_envs("vector_worlds:Agents", {}, seeds, "auto")
+    again = in_process_envs("vector_envs:Agents", {}, seeds, "auto")
     snapshots = [envs.snapshot(index) for index in range(6)]
     for index in range(6):
         seen = again.restore(index, snapshots[index])
@@ -149,7 +149,7 @@ def test_agents_are_rows_and_one_that_leaves_waits_for_the_others() -> None:
 
 
 def test_a_policy_of_agents_is_evaluated_on_all_of_them() -> None:
-    env = make_env("vector_worlds:Agents", {})
+    env = make_env("vector_envs:Agents", {})
     assert isinstance(env, AgentsAsOne)
     seen, _ = env.reset(seed=1)
     assert seen.shape == (3, 3)
@@ -165,7 +165,7 @@ def test_a_policy_of_agents_is_evaluated_on_all_of_them() -> None:
 @pytest.mark.slow
 def test_agents_train_and_resume_exactly() -> None:
     settings = {"arm": "ppo", "envs": 3, "rollout_steps": 24, "minibatches": 2, "eval_every": 72}
-    job = make_job("vector_worlds:Agents", **settings, eval_episodes=1, steps=216)
+    job = make_job("vector_envs:Agents", **settings, eval_episodes=1, steps=216)
     whole, first = train_here(job), train_here(job, 1)
     again = train_here(resumed(job, first))
     assert equal(again.final, whole.final) and first.rows + again.rows == whole.rows
@@ -174,16 +174,16 @@ def test_agents_train_and_resume_exactly() -> None:
 
 
 def test_a_function_with_its_own_number_of_envs_is_a_plain_environment() -> None:
-    env = make_env("vector_worlds:numbered", {"num_envs": 3})
-    assert isinstance(env, vector_worlds.Counting)
+    env = make_env("vector_envs:numbered", {"num_envs": 3})
+    assert isinstance(env, vector_envs.Counting)
 
 
 def test_agents_are_refused_what_they_cannot_do() -> None:
     with pytest.raises(BadInput, match="envs: 2 is no multiple of the 3 agents"):
-        make_job("vector_worlds:Agents", arm="ppo", envs=2)
+        make_job("vector_envs:Agents", arm="ppo", envs=2)
     with pytest.raises(BadInput, match="recurrent: a policy of several agents"):
-        make_job("vector_worlds:Agents", arm="ppo", envs=3, minibatches=2, recurrent="gru")
+        make_job("vector_envs:Agents", arm="ppo", envs=3, minibatches=2, recurrent="gru")
     with pytest.raises(BadInput, match="filter cannot pass over agents that wait"):
-        make_job("vector_worlds:Agents", arm="sauna", envs=3, dropped="mask")
+        make_job("vector_envs:Agents", arm="sauna", envs=3, dropped="mask")
     with pytest.raises(BadInput, match="agent b has another observation space than a"):
-        make_job("vector_worlds:Agents", arm="ppo", envs=3, env_kwargs='{"wide": true}')
+        make_job("vector_envs:Agents", arm="ppo", envs=3, env_kwargs='{"wide": true}')

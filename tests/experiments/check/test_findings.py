@@ -15,7 +15,7 @@ from sauna.config.plugins import name_of
 from sauna.experiments.check.findings import WARNING, WRONG, check
 from sauna.experiments.check.played import why_outside
 from sauna.system.errors import BadInput
-from vector_worlds import Agents
+from vector_envs import Agents
 
 
 class Good(gymnasium.Env):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sauna
-import worlds
+import small_envs
 from faults.hostile_runs import change_manifest
 from helpers import SMALL
 from sauna import cli
@@ -34,31 +34,35 @@ def run(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("evaluated") / "run"
     kept = {"checkpoint_every": 1, "keep_checkpoints": 3, "eval_every": 32, "eval_episodes": 1}
     kwargs = {"first": 1000, "step": 2}  # no number is bad before episode 1000
-    sauna.train("worlds:NotANumber", quiet=True, out=path, env_kwargs=kwargs, **SETTINGS, **kept)
+    sauna.train(
+        "small_envs:NotANumber", quiet=True, out=path, env_kwargs=kwargs, **SETTINGS, **kept
+    )
     return path
 
 
 @pytest.fixture(scope="module")
 def endless(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("endless") / "run"
-    sauna.train("worlds:Never", quiet=True, out=path, **SETTINGS)
+    sauna.train("small_envs:Never", quiet=True, out=path, **SETTINGS)
     return path
 
 
 def test_the_runs_own_arguments_stay_and_can_be_changed(run: Path) -> None:
     artifact = load_artifact(run)
     own = {"first": 1000, "step": 2}
-    assert kwargs_of(artifact, None, None) == kwargs_of(artifact, "worlds:NotANumber", None) == own
-    assert kwargs_of(artifact, "worlds:NotANumber", {"step": 5}) == {"first": 1000, "step": 5}
+    assert (
+        kwargs_of(artifact, None, None) == kwargs_of(artifact, "small_envs:NotANumber", None) == own
+    )
+    assert kwargs_of(artifact, "small_envs:NotANumber", {"step": 5}) == {"first": 1000, "step": 5}
     assert kwargs_of(artifact, None, '{"step": 5}') == {"first": 1000, "step": 5}
-    assert kwargs_of(artifact, "worlds:Scripted", None) == {}
+    assert kwargs_of(artifact, "small_envs:Scripted", None) == {}
     with pytest.raises(BadInput, match="env_kwargs: cannot read"):
         kwargs_of(artifact, None, "[1]")
 
 
 def test_the_same_environment_by_name_plays_the_same_episodes(run: Path, capsys) -> None:
     plain = sauna.evaluate(run, episodes=2)
-    named = sauna.evaluate(run, episodes=2, env="worlds:NotANumber")
+    named = sauna.evaluate(run, episodes=2, env="small_envs:NotANumber")
     assert named["members"] == plain["members"]
     arguments = ["eval", str(run), "--episodes", "2", "--env-kwargs", '{"speed": 3}']
     with pytest.raises(SystemExit) as exit:
@@ -178,17 +182,17 @@ def test_render_mode_and_size_among_the_arguments_can_be_filmed(endless: Path) -
 
 
 def test_what_has_pictures() -> None:
-    check_drawn("worlds:Never", {})
-    check_drawn("worlds:Never", {"breaks": 1})  # whether it can be drawn is another question
-    without_render = name_of(lambda **kwargs: worlds.Scripted())
-    for env in ("worlds:Scripted", "jax_worlds:make_walk", without_render):
+    check_drawn("small_envs:Never", {})
+    check_drawn("small_envs:Never", {"breaks": 1})  # whether it can be drawn is another question
+    without_render = name_of(lambda **kwargs: small_envs.Scripted())
+    for env in ("small_envs:Scripted", "jax_envs:make_walk", without_render):
         with pytest.raises(BadInput, match=r"takes render_mode='rgb_array' and has render\(\)"):
             check_drawn(env, {})
 
 
 @pytest.mark.parametrize("rate", [None, 0, "fast", float("nan"), -3])
 def test_a_rate_that_is_none_is_thirty(rate) -> None:
-    env = worlds.Never()
+    env = small_envs.Never()
     env.metadata = {"render_fps": rate}
     assert frames_per_second(env) == 30.0
     env.metadata = None
@@ -207,14 +211,16 @@ def test_stretched_actions_are_played_as_they_were_trained(tmp_path: Path) -> No
     lengths = {}
     for stretched in (True, False):
         out = tmp_path / str(stretched)
-        run = sauna.train("worlds:Wide", quiet=True, out=out, rescale_actions=stretched, **SETTINGS)
+        run = sauna.train(
+            "small_envs:Wide", quiet=True, out=out, rescale_actions=stretched, **SETTINGS
+        )
         assert run_directory.read_config(run.path)["config"]["rescale_actions"] is stretched
         lengths[stretched] = float(run.policy()(np.zeros(1))[0])
     assert 300 < lengths[True] < 700 and lengths[False] < 5
 
 
 def test_a_run_of_parts_is_trained_and_played(tmp_path: Path) -> None:
-    run = sauna.train("worlds:Parts", quiet=True, out=tmp_path / "run", **SETTINGS)
+    run = sauna.train("small_envs:Parts", quiet=True, out=tmp_path / "run", **SETTINGS)
     assert run_directory.read_config(run.path)["spaces"][:2] == ["vector", [9]]
     assert sauna.evaluate(run.path, episodes=1)["members"]["ppo/0"]["lengths"] == [4]
     assert episodes.MAX_STEPS == 30_000

@@ -269,7 +269,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     own = {"filter": "own_rules:likely", "filter_kwargs": '{"least": -3.6}', "dropped": "mask"}
     out = tmp_path_factory.mktemp("rules") / "run"
     with trained_here():
-        return sauna.train("worlds:Scripted", quiet=True, out=out, **settings, **own).path
+        return sauna.train("small_envs:Scripted", quiet=True, out=out, **settings, **own).path
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from sauna.experiments.study.execute.ray_node import Hub
 from sauna.experiments.study.tables import settings
 
 STUDY = """
-tasks = ["worlds:Scripted"]
+tasks = ["small_envs:Scripted"]
 seeds = 4
 steps = {steps}
 rollout_steps = 64
@@ -320,7 +320,7 @@ def test_a_failing_seed_is_reported_and_the_others_complete(place: Place) -> Non
     text = STUDY.format(steps=1024).replace("Scripted", "Unlucky").replace("seeds = 4", "seeds = 2")
     (place.path / "mine.toml").write_text(text)
     said = place.finish(start(place, "--processes=2", "--on=ray", folder="ray"))
-    assert "FAILED: worlds:Unlucky, sauna, seed 1: " in said
+    assert "FAILED: small_envs:Unlucky, sauna, seed 1: " in said
     results = json.loads((place.path / "ray/runs/mine/results.json").read_text())
     for cell in results["cells"]:
         assert [m["status"] for m in cell["members"]] == ["complete", "failed"]

@@ -318,7 +318,7 @@ def test_a_tournament_of_all_rules_goes_on_after_a_signal_to_the_same_result(
     """Of three seeds each; the signal comes once the first unit is complete."""
     flags = ["--arms", "all", "--processes=2", *small_flags(seeds=3)]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    command = ["compare", "worlds:Scripted", *flags, "--out"]
+    command = ["compare", "small_envs:Scripted", *flags, "--out"]
     done = sauna(*command, str(whole))
     assert done.returncode == 0, done.stderr
     started = subprocess.Popen(

@@ -261,7 +261,7 @@ def folder_of(out: Path) -> Path:
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("compared")
-    done = sauna_here("compare", "worlds:Scripted", "--out", str(out), *FLAGS)
+    done = sauna_here("compare", "small_envs:Scripted", "--out", str(out), *FLAGS)
     assert done.returncode == 0, done.stderr
     (out / "stdout.txt").write_text(done.stdout)
     return out
@@ -305,7 +305,7 @@ def test_in_processes_as_a_user_starts_them_the_rows_are_the_same(
     compared: Path, tmp_path: Path
 ) -> None:
     flags = [*small_flags(seeds=2), "--processes=1", "--arms=ppo"]
-    done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *flags)
+    done = sauna("compare", "small_envs:Scripted", "--out", str(tmp_path), *flags)
     assert done.returncode == 0, done.stderr
     expected, got = rows_of(compared), rows_of(tmp_path)
     assert len(got) == 1
@@ -320,14 +320,16 @@ def stamps(out: Path) -> dict[Path, int]:
 
 def test_running_again_repeats_nothing(compared: Path) -> None:
     before = stamps(compared)
-    done = sauna_here("compare", "worlds:Scripted", "--out", str(compared), *FLAGS)
+    done = sauna_here("compare", "small_envs:Scripted", "--out", str(compared), *FLAGS)
     assert done.returncode == 0
     assert stamps(compared) == before
 
 
 def test_python_finds_what_the_command_made(compared: Path) -> None:
     before = stamps(compared)
-    summary = compare("worlds:Scripted", seeds=2, out=compared, processes=2, quiet=True, **QUICK)
+    summary = compare(
+        "small_envs:Scripted", seeds=2, out=compared, processes=2, quiet=True, **QUICK
+    )
     assert stamps(compared) == before
     place = next(p for p in compared.iterdir() if p.name.startswith("compare_"))
     assert json.loads((place / "summary.json").read_text()) == summary
@@ -338,12 +340,14 @@ def test_python_finds_what_the_command_made(compared: Path) -> None:
 def test_in_python_quiet_is_quiet_also_from_a_thread(compared: Path, capfd) -> None:
     found: list[Any] = []
     settings = {"seeds": 2, "out": compared, "processes": 2, "quiet": True, **QUICK}
-    thread = threading.Thread(target=lambda: found.append(compare("worlds:Scripted", **settings)))
+    thread = threading.Thread(
+        target=lambda: found.append(compare("small_envs:Scripted", **settings))
+    )
     thread.start()
     thread.join()
     assert found[0]["table"] and capfd.readouterr().out == ""
     with pytest.raises(BadInput, match="processes: must be"):
-        compare("worlds:Scripted", out=compared / "none", processes=-1)
+        compare("small_envs:Scripted", out=compared / "none", processes=-1)
     assert not (compared / "none").exists()
 
 
@@ -366,7 +370,7 @@ def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp
         "-m",
         "sauna",
         "compare",
-        "worlds:Scripted",
+        "small_envs:Scripted",
         "--out",
         str(tmp_path),
         *FLAGS,
@@ -377,7 +381,7 @@ def test_killed_at_any_moment_it_continues_to_the_same_bytes(compared: Path, tmp
         started.send_signal(number)
         assert started.wait(60) in (-9, 143, 0)
         wait_for_units(tmp_path)
-    done = sauna("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
+    done = sauna("compare", "small_envs:Scripted", "--out", str(tmp_path), *FLAGS)
     assert done.returncode == 0, done.stderr
     expected = rows_of(compared)
     got = rows_of(tmp_path)
@@ -403,13 +407,13 @@ def wait_for_units(out: Path) -> None:
 def test_a_failed_seed_is_shown_and_the_others_go_on(tmp_path: Path) -> None:
     """Seed 1 of every arm fails twice; its unit is split."""
     arms: list[dict[str, Any]] = [{"label": "sauna"}, {"label": "sauna+random"}]
-    text = {"tasks": ["worlds:Unlucky"], "seeds": 3, "arms": arms, **QUICK}
+    text = {"tasks": ["small_envs:Unlucky"], "seeds": 3, "arms": arms, **QUICK}
     lines = [f"{k} = {json.dumps(v)}" for k, v in text.items() if k != "arms"]
     lines += [f"[[arms]]\nlabel = {json.dumps(arm['label'])}" for arm in arms]
     (tmp_path / "unlucky.toml").write_text("\n".join(lines))
     done = sauna("study", "unlucky.toml", "--trust", "--out=out", "--processes=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "FAILED: worlds:Unlucky, sauna, seed 1" in done.stdout
+    assert "FAILED: small_envs:Unlucky, sauna, seed 1" in done.stdout
     results = json.loads((tmp_path / "out" / "unlucky" / "results.json").read_text())
     sauna_cell, control_cell = results["cells"]
     assert [m["status"] for m in sauna_cell["members"]] == ["complete", "failed", "complete"]
@@ -436,16 +440,16 @@ def test_a_complete_run_counts_even_if_the_unit_was_split(tmp_path: Path) -> Non
 def test_a_second_study_in_the_same_place_is_refused(tmp_path: Path) -> None:
     (tmp_path / "units").mkdir()
     with run_directory.lock(tmp_path / "units"):
-        done = sauna_here("compare", "worlds:Scripted", "--out", str(tmp_path), *FLAGS)
+        done = sauna_here("compare", "small_envs:Scripted", "--out", str(tmp_path), *FLAGS)
     assert done.returncode == 2 and "is in use by process" in done.stderr
     assert {path.name for path in tmp_path.rglob("*")} == {"units", ".lock"}
 
 
 def test_where_a_file_is_in_the_way_nothing_is_made(tmp_path: Path) -> None:
-    spec = comparison("worlds:Scripted", COMPARED, {"seeds": 4, **QUICK})
+    spec = comparison("small_envs:Scripted", COMPARED, {"seeds": 4, **QUICK})
     (tmp_path / spec.name).write_text("")
     with pytest.raises(BadInput, match="is no folder"):
-        compare("worlds:Scripted", out=tmp_path, seeds=4, quiet=True, **QUICK)
+        compare("small_envs:Scripted", out=tmp_path, seeds=4, quiet=True, **QUICK)
     assert [path.name for path in tmp_path.iterdir()] == [spec.name]
 
 
@@ -478,7 +482,7 @@ def test_what_a_run_would_refuse_is_refused_before_anything_is_made(tmp_path: Pa
 @pytest.mark.slow
 def test_a_study_without_any_result_exits_1(tmp_path: Path) -> None:
     flags = [*small_flags(seeds="1,"), "--arms=ppo", "--processes=1"]
-    done = sauna("compare", "worlds:Unlucky", "--out", str(tmp_path), *flags)
+    done = sauna("compare", "small_envs:Unlucky", "--out", str(tmp_path), *flags)
     assert done.returncode == 1 and "no training ended well" in done.stderr
 
 

@@ -60,5 +60,5 @@ def test_auto_names_the_runs_as_the_preset_itself_does() -> None:
 def test_a_comparison_takes_auto_too() -> None:
     spec = comparison("LunarLander-v3", COMPARED, {"preset": "auto"})
     assert {check(arm, "LunarLander-v3").preset for arm in spec.arms} == {"lunar-lander"}
-    with pytest.raises(BadInput, match="the zoo knows no worlds:Scripted"):
-        comparison("worlds:Scripted", COMPARED, {"preset": "auto"})
+    with pytest.raises(BadInput, match="the zoo knows no small_envs:Scripted"):
+        comparison("small_envs:Scripted", COMPARED, {"preset": "auto"})

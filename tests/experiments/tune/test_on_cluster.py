@@ -89,7 +89,7 @@ def test_a_trial_that_fails_is_shown_and_costs_the_others_nothing(
     assert good == here["trials"][0]
     assert (bad["state"], bad["error"], bad["env_steps"]) == ("fail", "its node was lost", 0)
     assert "failed: its node was lost" in (folder / "trials.txt").read_text()
-    assert "FAILED: worlds:MatchingAction, trial-1, seed 1: its node was lost" in (
+    assert "FAILED: small_envs:MatchingAction, trial-1, seed 1: its node was lost" in (
         capsys.readouterr().out
     )
     # Once more as a whole, then each of its seeds; never again when the tuning goes on.
@@ -178,7 +178,7 @@ def test_stopped_and_continued_it_finds_what_this_machine_finds(place: Place, mo
     monkeypatch.delenv("RAY_AUTH_TOKEN_PATH")
     (place.path / "space.toml").write_text(SPACE)
     flags = small_flags(steps=STEPS, rollout_steps=64, preset="discrete")
-    tune = ["tune", "worlds:MatchingAction", *flags, "--space=../space.toml"]
+    tune = ["tune", "small_envs:MatchingAction", *flags, "--space=../space.toml"]
     tune += ["--trials=3", "--lockstep=2", "--finalists=1", "--fresh-seeds=2"]
     place.finish(place.start(*tune, folder="here"))
     remote = [*tune, "--on=ray", "--processes=2"]
@@ -187,7 +187,7 @@ def test_stopped_and_continued_it_finds_what_this_machine_finds(place: Place, mo
     until(lambda: place.runs(started) and list((place.path / "ray").glob(saved)))
     started.send_signal(signal.SIGINT)
     said = place.finish(started, 130)
-    assert "continue with: sauna tune worlds:MatchingAction" in said and said.strip().endswith(
+    assert "continue with: sauna tune small_envs:MatchingAction" in said and said.strip().endswith(
         "--on ray"
     )
     until(lambda: not place.processes(), 60)

@@ -17,7 +17,7 @@ from sauna.experiments.tune.space import read_space
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, Interrupted
 
-GIVEN = {"env": "worlds:MatchingAction", **{k: v for k, v in SMALL.items() if k != "seeds"}}
+GIVEN = {"env": "small_envs:MatchingAction", **{k: v for k, v in SMALL.items() if k != "seeds"}}
 GIVEN |= {"preset": "discrete", "steps": 192}  # 6 iterations of 32 steps
 SPACE = "learning_rate = {low = 1e-4, high = 1e-1, log = true}\ngamma = [0.5, 0.9, 0.99]\n"
 

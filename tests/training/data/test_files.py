@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import worlds
+import small_envs
 from sauna.envs.make import make_env
 from sauna.envs.spaces import action_writer, describe
 from sauna.experiments.record import _Listener, _writer
@@ -31,12 +31,12 @@ def extras() -> None:
 
 
 KINDS: dict[str, dict[str, Any]] = {
-    "worlds:Scripted": {},
-    "worlds:Picture": {},
-    "worlds:Board": {},
-    "worlds:Parts": {},
-    "worlds:Wide": {},
-    "worlds:Spaced": {"observation": "dict", "action": "multi_discrete"},
+    "small_envs:Scripted": {},
+    "small_envs:Picture": {},
+    "small_envs:Board": {},
+    "small_envs:Parts": {},
+    "small_envs:Wide": {},
+    "small_envs:Spaced": {"observation": "dict", "action": "multi_discrete"},
 }
 
 
@@ -105,7 +105,7 @@ def test_minari_users_find_the_dataset_and_pandas_users_the_table(tmp_path, monk
 
 
 def test_a_table_of_somebody_else_needs_five_columns(tmp_path: Path) -> None:
-    spaces = describe(worlds.Scripted.observation_space, worlds.Scripted.action_space)
+    spaces = describe(small_envs.Scripted.observation_space, small_envs.Scripted.action_space)
     columns = {
         "episode": [0, 0, 1],
         "observation": [[1.0, 2.0, 3.0]] * 3,
@@ -118,7 +118,7 @@ def test_a_table_of_somebody_else_needs_five_columns(tmp_path: Path) -> None:
         path = tmp_path / "theirs.parquet"
         table = {k: v for k, v in {**columns, **changes}.items() if v is not None}
         pyarrow.parquet.write_table(pyarrow.table(table), path)
-        return list(read_parquet(path, "data:theirs", spaces, "worlds:Scripted"))
+        return list(read_parquet(path, "data:theirs", spaces, "small_envs:Scripted"))
 
     import pyarrow.parquet
 
@@ -142,15 +142,15 @@ def test_a_table_of_somebody_else_needs_five_columns(tmp_path: Path) -> None:
 
 def test_other_spaces_and_taken_names_are_refused(tmp_path: Path) -> None:
     for to in (str(tmp_path / "a.parquet"), f"minari:{tmp_path}/a-v0"):
-        recorded("worlds:Scripted", {}, to)
-        prepared = prepare({"env": "worlds:Endless", "arm": "ppo", "init_from": f"data:{to}"})
-        with pytest.raises(BadInput, match="has other spaces than worlds:Endless: observation"):
+        recorded("small_envs:Scripted", {}, to)
+        prepared = prepare({"env": "small_envs:Endless", "arm": "ppo", "init_from": f"data:{to}"})
+        with pytest.raises(BadInput, match="has other spaces than small_envs:Endless: observation"):
             _read(prepared)
         with pytest.raises(BadInput, match="is there already"):
-            recorded("worlds:Scripted", {}, to)
+            recorded("small_envs:Scripted", {}, to)
     with pytest.raises(BadInput, match="no name of a Minari dataset"):
-        recorded("worlds:Scripted", {}, f"minari:{tmp_path}/noversion")
-    spaces = describe(worlds.Scripted.observation_space, worlds.Scripted.action_space)
+        recorded("small_envs:Scripted", {}, f"minari:{tmp_path}/noversion")
+    spaces = describe(small_envs.Scripted.observation_space, small_envs.Scripted.action_space)
     with pytest.raises(BadInput, match="cannot be read as a Minari dataset"):
         list(read_minari(f"minari:{tmp_path}/none-v0", "data:none", spaces, ""))
 
@@ -158,19 +158,19 @@ def test_other_spaces_and_taken_names_are_refused(tmp_path: Path) -> None:
 def test_a_dataset_that_would_make_its_environment_is_refused(tmp_path: Path) -> None:
     import json
 
-    recorded("worlds:Scripted", {}, f"minari:{tmp_path}/a-v0")
+    recorded("small_envs:Scripted", {}, f"minari:{tmp_path}/a-v0")
     file = tmp_path / "a-v0" / "data" / "metadata.json"
     stored = json.loads(file.read_text())
     del stored["action_space"]
     file.write_text(json.dumps({**stored, "env_spec": '{"id": "nowhere:Evil-v0"}'}))
-    spaces = describe(worlds.Scripted.observation_space, worlds.Scripted.action_space)
+    spaces = describe(small_envs.Scripted.observation_space, small_envs.Scripted.action_space)
     with pytest.raises(BadInput, match="does not say its spaces"):
         list(read_minari(f"minari:{tmp_path}/a-v0", "data:a", spaces, ""))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a-v0"]
 
 
 def test_nothing_is_left_of_a_recording_that_failed(tmp_path: Path) -> None:
-    made = make_env("worlds:Scripted", {})
+    made = make_env("small_envs:Scripted", {})
     spaces = describe(made.observation_space, made.action_space)
     for to in (str(tmp_path / "a.parquet"), f"minari:{tmp_path}/a-v0"):
         with (

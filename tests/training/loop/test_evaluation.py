@@ -11,7 +11,7 @@ import pytest
 
 import sauna
 from helpers import SMALL, Recorder, equal, make_job, own, resumed, train_here
-from jax_worlds import LENGTH, informative
+from jax_envs import LENGTH, informative
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.rollout.play import Episode, play, play_on_device
 from sauna.config.presets import resolve
@@ -20,9 +20,9 @@ from sauna.system.errors import BadInput
 from sauna.training.loop.evaluation import Evaluated
 from sauna.training.summary import STOPS, summarize
 from sauna.training.worker import train_members
-from worlds import Informative, Scripted
+from small_envs import Informative, Scripted
 
-BACKENDS = {"host": "worlds:Scripted", "device": "jax_worlds:walk"}
+BACKENDS = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}
 WATCHED = {"eval_every": 64, "eval_episodes": 3, "checkpoint_every": 1}
 
 
@@ -166,7 +166,7 @@ def test_stops_and_the_last_evaluation_stand_in_the_summary() -> None:
 @pytest.mark.parametrize("name", ["eval_episodes", "stop_at", "stop_when_flat"])
 def test_what_only_evaluations_read_is_refused_without_them(name: str, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=f"{name}: not read .* it needs eval_every above 0"):
-        sauna.train("worlds:Scripted", out=tmp_path / "run", **{**SMALL, name: 3})
+        sauna.train("small_envs:Scripted", out=tmp_path / "run", **{**SMALL, name: 3})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -187,7 +187,7 @@ def test_an_episode_says_whether_it_was_a_success() -> None:
 
 
 def test_an_episode_on_the_device_says_so_too() -> None:
-    job = make_job("jax_worlds:informative", arm="ppo", backend="device", device="cpu")
+    job = make_job("jax_envs:informative", arm="ppo", backend="device", device="cpu")
     policy = make_policy(job.config, job.spaces)
     played = play_on_device(
         policy.init(jax.random.key(0)),

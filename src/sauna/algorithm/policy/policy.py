@@ -251,13 +251,15 @@ def check_collections(config: Config, variables: Params) -> None:
         )
 
 
-def act(policy: Policy, params: Array, observation: Array, noise: Array) -> Array:
-    """Actions `[N, A]` in the N envs of a member.
+def act(policy: Policy, params: Array, observation: Array, noise: Array) -> tuple[Array, Array]:
+    """Actions `[N, A]` in the N envs of a member, and their scores `[N, 3]` as `score` gives them.
 
     Args:
       observation: `[N, *obs]` normalised; noise: `[N, M]` from `distribution.draw`.
     """
-    return policy.sample(params, policy.apply(params, observation), noise)
+    output = policy.apply(params, observation)
+    action = policy.sample(params, output, noise)
+    return action, scores_of(policy, output, action)
 
 
 def score(policy: Policy, params: Array, observation: Array, action: Array) -> Array:

@@ -1,8 +1,9 @@
 """How the members of a process choose actions at each vector step.
 
-Acting needs the policy head alone: log-probabilities, values and Vex are computed afterwards for a
-whole segment (`Program.score`). For an MLP the few small products are a loop of our own, because a
-call of a JAX program costs more than they do; another network acts by such a call.
+For an MLP the few small products are a loop of our own, because a call of a JAX program costs more
+than they do. Acting needs the policy head alone: log-probabilities, values and Vex are computed
+afterwards for a whole segment (`Program.score`). Another network acts by a call of a JAX program,
+which gives these scores as well: a second pass through a CNN would take as long as the first.
 """
 
 from __future__ import annotations
@@ -28,7 +29,15 @@ _TANH, _RELU, _ELU, _GELU, _LEAKY_RELU, _SELU, _SIGMOID = range(7)  # places in 
 
 
 class Actor(Protocol):
-    """Chooses the actions of P members."""
+    """Chooses the actions of P members.
+
+    Attributes:
+      gives_scores: whether `scores` holds log-probability, value and Vex `[P, N, 3]` of the last
+        actions; otherwise they have to be computed afterwards.
+    """
+
+    gives_scores: bool
+    scores: np.ndarray
 
     def load(self, params: np.ndarray) -> None:
         """Takes over the parameters `[P, D]` of the coming rollout."""
@@ -48,9 +57,12 @@ class Actor(Protocol):
 class CompiledActor:
     """Acts by `Program.act`, whatever the network is."""
 
+    gives_scores = True
+
     def __init__(self, act: Any) -> None:
         self._act = act
         self._params: Any = None
+        self.scores = np.zeros(0)
 
     def load(self, params: np.ndarray) -> None:
         import jax.numpy as jnp
@@ -61,11 +73,15 @@ class CompiledActor:
         return noise
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        return np.asarray(self._act(self._params, observation, noise))
+        action, scores = self._act(self._params, observation, noise)
+        self.scores = np.asarray(scores)
+        return np.asarray(action)
 
 
 class RecurrentActor(CompiledActor):
     """Acts by `Program.act` with the states of `memory`, and moves them on."""
+
+    gives_scores = False
 
     def __init__(self, act: Any, memory: HostMemory) -> None:
         super().__init__(act)
@@ -80,26 +96,28 @@ class RecurrentActor(CompiledActor):
 class MLPActor:
     """Acts by a compiled loop, for the MLP trunks of `policy/networks.py`.
 
-    Each layer's weights have a last row, the biases. Layers that are normalised have two rows in
-    `_norms`, scales and biases; others have none.
+    Below each layer's weights stands a row of biases; below that, if layers are normalised, a row
+    of scales and one of biases. Numba looks at every array of a call, so that few are faster.
     """
+
+    gives_scores = False
+    scores = np.zeros(0)
 
     def __init__(self, config: Config, spaces: Spaces, policy: Policy, members: int) -> None:
         self._policy, self._sample = policy, _sampler(config, spaces)
         self._expln, self._adds = config.sde_expln, _noise_kind(config, spaces)
         self._trunk = "trunk" if config.trunk == "shared" else "policy_trunk"
-        self._function = ACTIVATIONS.index(config.activation)
         self._layers = [f"layer_{i}" for i in range(len(config.hidden))]
         widths = [spaces.numbers, *config.hidden, policy.distribution.num_outputs]
-        self._mask = spaces.mask
+        self._outputs = widths[-1]
+        self._norm_rows = 2 * config.layer_norm
+        function = ACTIVATIONS.index(config.activation)
+        self._how = self._norm_rows, function, self._adds, spaces.mask
         self._weights = tuple(
-            np.zeros((members, before + 1, after), np.float32)
+            np.zeros((members, before + 1 + self._norm_rows, after), np.float32)
             for before, after in itertools.pairwise(widths)
         )
         self._hidden = np.zeros((len(self._layers), config.envs, max(config.hidden)), np.float32)
-        self._norms = tuple(
-            np.zeros((members, 2 * config.layer_norm, width), np.float32) for width in config.hidden
-        )
         self._scale: Any = np.float32(1.0)
         if policy.distribution.has_log_std:
             features = widths[-2] if self._adds == MATRIX else 1
@@ -110,10 +128,11 @@ class MLPActor:
             tree = self._policy.unravel(vector)["params"]
             layers = [tree[self._trunk][name] for name in self._layers] + [tree["policy_head"]]
             for weight, layer in zip(self._weights, layers, strict=True):
-                weight[p, :-1], weight[p, -1] = layer["kernel"], layer["bias"]
-            for i, norm in enumerate(self._norms):
-                if len(norm[p]):
-                    norm[p] = [tree[self._trunk][f"norm_{i}"][name] for name in ("scale", "bias")]
+                inputs = len(layer["kernel"])
+                weight[p, :inputs], weight[p, inputs] = layer["kernel"], layer["bias"]
+            for i, weight in enumerate(self._weights[:-1] if self._norm_rows else ()):
+                norm = tree[self._trunk][f"norm_{i}"]
+                weight[p, -2:] = norm["scale"], norm["bias"]
             if self._adds == MATRIX:
                 self._scale[p] = np.asarray(deviation(tree["log_std"], self._expln)).ravel()
             elif "log_std" in tree:
@@ -123,9 +142,8 @@ class MLPActor:
         return noise * self._scale
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        noisy = np.empty((*noise.shape[:2], self._weights[-1].shape[-1]), np.float32)
-        form = self._weights, self._norms, self._function
-        _act(observation, *form, self._hidden, noise, self._adds, noisy, self._mask)
+        noisy = np.empty((*noise.shape[:2], self._outputs), np.float32)
+        _act(observation, self._weights, self._hidden, noise, noisy, *self._how)
         return self._sample(noisy, noise)
 
 
@@ -133,12 +151,12 @@ class MLPActor:
 def _act(
     observation: Any,
     weights: Any,
-    norms: Any,
-    function: int,
     hidden: Any,
     noise: Any,
-    adds: int,
     noisy: Any,
+    norm_rows: int,
+    function: int,
+    adds: int,
     mask: int,
 ) -> None:
     """Writes the policy head's outputs and their noise, member by member, to `noisy` `[P, N, K]`.
@@ -154,9 +172,9 @@ def _act(
             for i in range(last):
                 weight = weights[i][p]
                 y = hidden[i, n, : weight.shape[1]]
-                _affine(x, weight, y)
-                if len(norms[i][p]):
-                    _normalize(y, norms[i][p])
+                _affine(x, weight, len(weight) - 1 - norm_rows, y)
+                if norm_rows:
+                    _normalize(y, weight)
                 if function == _TANH:
                     _tanh(y)
                 else:
@@ -164,7 +182,7 @@ def _act(
                         y[j] = _activated(y[j], function)
                 x = y
             y = noisy[p, n]
-            _affine(x, weights[last][p], y)
+            _affine(x, weights[last][p], weights[last].shape[1] - 1 - norm_rows, y)
             if adds == ADDED:
                 for j in range(len(y)):
                     y[j] += noise[p, n, j]
@@ -178,9 +196,8 @@ def _act(
 
 
 @compiled
-def _affine(x: Any, weight: Any, y: Any) -> None:
-    """`y = x @ weight[:-1] + weight[-1]`; four inputs at a time, as y is written that often."""
-    inputs = len(weight) - 1
+def _affine(x: Any, weight: Any, inputs: int, y: Any) -> None:
+    """`y = x @ weight[:inputs] + weight[inputs]`, four inputs at a time to write y less often."""
     y[:] = weight[inputs]
     whole = inputs - inputs % 4
     for k in range(0, whole, 4):
@@ -195,12 +212,13 @@ def _affine(x: Any, weight: Any, y: Any) -> None:
 
 
 @compiled
-def _normalize(y: Any, norm: Any) -> None:
-    """Layer normalisation in place, with flax's epsilon; `norm` `[2, len(y)]`: scales, biases."""
+def _normalize(y: Any, weight: Any) -> None:
+    """Layer normalisation in place, with flax's epsilon, by the last two rows: scales, biases."""
+    scales = len(weight) - 2
     mean = y.mean()
     scale = np.float32(1) / math.sqrt(((y - mean) ** 2).mean() + np.float32(1e-6))
     for j in range(len(y)):
-        y[j] = (y[j] - mean) * scale * norm[0, j] + norm[1, j]
+        y[j] = (y[j] - mean) * scale * weight[scales, j] + weight[scales + 1, j]
 
 
 @compiled

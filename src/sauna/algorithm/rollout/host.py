@@ -1,10 +1,10 @@
 """Collecting rollouts from host environments, for all members of a process in lockstep.
 
 Acting, scoring and filtering are separate: the policy acts for a segment of steps, then one
-compiled call per member computes log-probabilities, values and Vex of the whole segment, and one
-more lets the filter decide about it. A decision never changes how an env acts, so this gives the
-mask that deciding after each step would give. With `dropped="replace"` a segment is as long as the
-smallest number of steps that some env still lacks: no env can overshoot.
+compiled call per member computes log-probabilities, values and Vex of the whole segment (if acting
+has not done so), and one more lets the filter decide about it. A decision never changes how an env
+acts, so this gives the mask that deciding after each step would give. With `dropped="replace"` a
+segment is as long as the smallest number of steps that some env still lacks: no env can overshoot.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sauna.algorithm.policy.normalize import (
 from sauna.algorithm.rollout.actor import make_actor
 from sauna.algorithm.rollout.collected import Collected, Episode, capacity, chunk_sizes
 from sauna.algorithm.rollout.memory import HostMemory
-from sauna.algorithm.rollout.moments import ObservationMoments, discounted_returns
+from sauna.algorithm.rollout.moments import ObservationMoments, discounted_returns, running_sum
 from sauna.algorithm.rollout.program import Program
 from sauna.algorithm.types import Hypers, Keys, Rollout, ScoredStep
 from sauna.envs.host.contract import HostEnvs, Step
@@ -167,7 +167,8 @@ class HostCollector:
             for member in members:
                 if plans[member].last == t:
                     first = plans[member].first
-                    self._score(params[member], member, first, t)
+                    if not self._actor.gives_scores:
+                        self._score(params[member], member, first, t)
                     self._decide(filters, keys, hypers[member], member, first, t)
                     plans[member] = self._plan(member, t, limit)
         self._fill_next_values(params, final_values, t)
@@ -181,8 +182,10 @@ class HostCollector:
                 np.zeros((size, *buffer.shape[2:]), buffer.dtype)
                 for buffer in (self._buffers.observation, self._buffers.action)
             )
-            memory = self._memory.of_segment(0, slice(0, size))
-            scores = np.asarray(self._program.score(params, observation, action, *memory))
+            scores = np.zeros((*observation.shape[:2], 3), np.float32)
+            if not self._actor.gives_scores:
+                memory = self._memory.of_segment(0, slice(0, size))
+                scores = np.asarray(self._program.score(params, observation, action, *memory))
             steps = ScoredStep(observation, action, *(scores[..., i] for i in range(3)))
             none = np.int32(0)
             self._program.decide(filters[0], steps, none, none, key, hypers)
@@ -224,13 +227,16 @@ class HostCollector:
         observations = self._observed
         self._memory.acting = acting
         waits, bounded = self._envs.waiting is not None, policy.distribution.bounded
+        hold, scored = policy.hold, actor.gives_scores
         actions, rewards = self._buffers.action.swapaxes(0, 1), self._rewards.swapaxes(0, 1)
         for row in range(first, last):
             if waits:
                 self._memory.acting = acting & ~self._waiting()
                 self._note_idle(row, acting)
-            own = noise[row % block // policy.hold]
+            own = noise[row % block // hold]
             actions[row] = action = actor.act(observations[row], own)
+            if scored:
+                self._write_scores((slice(None), row), actor.scores)
             shown = to_env(policy.distribution, action) if bounded else action
             step = self._envs.step(shown.reshape(-1, width), active)
             rewards[row] = step.reward.reshape(shape)
@@ -309,16 +315,19 @@ class HostCollector:
         return np.asarray(self._program.value(params[member], observation, *state))
 
     def _score(self, params: np.ndarray, member: int, first: int, last: int) -> None:
-        """Writes log-probability, value and Vex for the rows of a member's segment."""
+        """Writes the scores of a member's segment."""
         buffers, rows = self._buffers, slice(first, last)
         observation = self._padded(buffers.observation[member, rows])
         action = self._padded(buffers.action[member, rows])
         memory = self._memory.of_segment(member, rows)
         memory[:1] = map(self._padded, memory[:1])
         found = self._program.score(params, observation, action, *memory)
-        scores = np.asarray(found)[: last - first]
+        self._write_scores((member, rows), np.asarray(found)[: last - first])
+
+    def _write_scores(self, place: Any, scores: np.ndarray) -> None:
+        """Writes log-probability, value and Vex `[..., 3]` to a place of the buffers."""
         for i, name in enumerate(("log_prob", "value", "vex")):
-            getattr(buffers, name)[member, rows] = scores[..., i]
+            getattr(self._buffers, name)[place] = scores[..., i]
 
     def _start_filters(self) -> list[Any]:
         return [] if self._program.filter is None else [self._fresh_filter for _ in self._keys]
@@ -438,11 +447,3 @@ class HostCollector:
         for part, value in zip(self.reward_moments, after, strict=True):
             part[member, 0] = value[-1]
         return scale_rewards(after, reward, self._config.clip_rewards)
-
-
-def running_sum(start: float, values: np.ndarray) -> float:
-    """`start + values[0] + values[1] + ...`, in this order, wherever the sum is interrupted."""
-    total = float(start)
-    for value in values.tolist():
-        total += value
-    return total

@@ -129,3 +129,11 @@ def discounted_returns(
                 now = 0.0
         sums[on, n], last[n] = column, now
     return sums, last
+
+
+def running_sum(start: float, values: np.ndarray) -> float:
+    """`start + values[0] + values[1] + ...`, in this order, wherever the sum is interrupted."""
+    total = float(start)
+    for value in values.tolist():
+        total += value
+    return total

@@ -30,8 +30,8 @@ class Program(NamedTuple):
     member's numbers must not depend on its neighbours, so members are never batched into one
     matrix product: `act` maps over them.
 
-    Of a recurrent policy, `act` also takes and gives states, `score` takes what `score_with_state`
-    does, and `value` takes states.
+    Of a recurrent policy, `act` takes and gives states instead of giving scores, `score` takes what
+    `score_with_state` does, and `value` takes states.
     """
 
     config: Config

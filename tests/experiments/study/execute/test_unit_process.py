@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from faults.canned import SAVED, SETTINGS, WORLD, played_back, record
+from faults.canned import ENV, SAVED, SETTINGS, played_back, record
 from sauna.config.trust import seal
 from sauna.experiments.measure.streams import load_snapshot
 from sauna.experiments.study.execute.unit_process import LineDisplay, train
@@ -23,7 +23,7 @@ def test_a_run_of_a_node_is_the_users_at_home(
     resumed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The node's user has another key; at home the run is measured all the same."""
-    overrides: dict[str, Any] = {"env": WORLD, **SETTINGS, **SAVED, "out": str(tmp_path / "run")}
+    overrides: dict[str, Any] = {"env": ENV, **SETTINGS, **SAVED, "out": str(tmp_path / "run")}
     recorded = {"out": "runs/at_home", "git": "abc", "seal": seal(overrides)}
     run = tmp_path / "run"
     with monkeypatch.context() as node, played_back(record()):

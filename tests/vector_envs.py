@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from worlds import World
+from small_envs import SmallEnv
 
 SAME, NEXT, DISABLED = (
     AutoresetMode.SAME_STEP,
@@ -17,7 +17,7 @@ SAME, NEXT, DISABLED = (
 )
 
 
-class Counting(World):
+class Counting(SmallEnv):
     """Shows the step. Action 1 in step 3 ends an episode; step 5 is a time limit."""
 
     def observe(self) -> np.ndarray:
