@@ -10,8 +10,11 @@ import pytest
 
 import sauna
 import small_envs
-from helpers import SMALL, equal, make_job, train_here
-from sauna.envs.spaces import describe
+from helpers import SMALL, equal, make_job, policy_output, train_here
+from sauna.algorithm.policy.bounded import to_env
+from sauna.algorithm.policy.normalize import Moments, normalize
+from sauna.algorithm.policy.policy import make_policy
+from sauna.envs.spaces import describe, observation_reader
 from sauna.system import run_directory
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
@@ -86,6 +89,53 @@ def test_members_start_with_the_clones_weights_and_the_datas_statistics(env: str
     assert word in said[0] and "log-likelihood" in said[0] and "loss" in said[0]
 
 
+@pytest.mark.parametrize("distribution", ["squashed", "beta", "gsde"])
+def test_every_distribution_of_actions_is_fitted(distribution: str, monkeypatch) -> None:
+    """Recorded actions are 0.9 or -0.9; of numbers before a tanh these would be 0.72."""
+    data = data_of(ENV)
+    data = data._replace(action=1.8 * data.action)
+    monkeypatch.setattr(cloning, "_read", lambda prepared: data)
+    fast = {"clone_epochs": 20, "clone_learning_rate": 0.03}
+    arrays, origin = initial(ENV, distribution=distribution, seeds=1, **fast)
+    own = under("ppo/0/observation_moments/", arrays)
+    seen = normalize(Moments(**own), data.observation, 10.0)
+    job = make_job(ENV, arm="ppo", distribution=distribution)
+    output = policy_output(job, arrays, "ppo/0", seen)
+    made = make_policy(job.config, job.spaces).distribution
+    action = to_env(made, np.asarray(made.mode(output.policy)))
+    assert abs(np.median(np.abs(action)) - 0.9) < 0.12
+    assert (np.sign(action) == np.sign(data.action)).mean() > 0.8
+    held = origin["members"]["ppo/0"]["held_out"]
+    assert held["agreement"] == 0.0  # of one episode of equal actions, but for their rounding
+
+
+def test_pictures_beside_numbers_are_cloned_and_have_no_moments(monkeypatch) -> None:
+    env, number = small_envs.Camera(), 9
+    spaces, read = (
+        describe(env.observation_space, env.action_space),
+        observation_reader(env.observation_space),
+    )
+    env.observation_space.seed(0)
+    episodes = []
+    for _ in range(12):
+        seen = np.stack([read(env.observation_space.sample()) for _ in range(number)])
+        seen[:, 2:] = 100  # the picture, behind the numbers
+        action = (seen[:-1, 0] > 0).astype(np.int64)
+        episodes.append(Stored(seen[:-1], seen[-1], action, seen[1:, 0], True))
+    data = demonstrations(episodes, spaces, env.action_space, False, NAME)
+    monkeypatch.setattr(cloning, "_read", lambda prepared: data)
+    settings = {"network": "mlp", "seeds": 1}
+    arrays, origin = initial("small_envs:Camera", clone_learning_rate=0.01, **settings)
+    numbers = np.concatenate([data.observation, data.final])[:, :2]
+    np.testing.assert_allclose(arrays["ppo/0/observation_moments/mean"], numbers.mean(0))
+    found = origin["members"]["ppo/0"]
+    assert found["held_out"]["log_likelihood"] > found["before"]["log_likelihood"]
+    plain = {name: value for name, value in SETTINGS.items() if name not in CLONING}
+    job = prepare({"env": "small_envs:Camera", **plain, **settings}).job(None)
+    state = train_here(job._replace(initial=arrays), stop=0).final
+    assert equal(under("ppo/0/params/", state), under("ppo/0/params/", arrays))
+
+
 def test_reward_moments_are_those_of_the_discounted_return() -> None:
     arrays, _ = initial(ENV, init_normalizer="kept", gamma=0.5, seeds=1)
     sums = []
@@ -136,8 +186,8 @@ def test_what_cannot_be_cloned_is_refused_in_a_line(tmp_path: Path, monkeypatch)
     fresh = {"init_normalizer": "fresh"}
     with pytest.raises(BadInput, match="fresh would show a clone what it was not fitted to"):
         initial(ENV, **fresh)
-    with pytest.raises(BadInput, match="is not supported with distribution squashed"):
-        initial(ENV, distribution="squashed")
+    with pytest.raises(BadInput, match="has no action masks"):
+        initial("small_envs:Choosy", action_mask=True)
     with pytest.raises(BadInput, match="clone_epochs: not read"):
         sauna.train(ENV, out=tmp_path / "run", quiet=True, **{**SETTINGS, "init_from": "RUN"})
     assert list(tmp_path.iterdir()) == []

@@ -62,15 +62,19 @@ def clone_members(
     """
     config = prepared.config
     name = config.init_from
-    _check_kind(prepared)
+    if prepared.spaces.mask:
+        raise BadInput("init_from: data:... has no action masks, which this policy acts by")
     if config.init_normalizer == "fresh" and config.normalize_observations:
         raise BadInput("init_normalizer: fresh would show a clone what it was not fitted to")
     data = _read(prepared)
     configure_jax()
     from sauna.algorithm.learner.cloning import make_cloner
+    from sauna.algorithm.policy.bounded import from_env
     from sauna.algorithm.policy.policy import make_policy
 
-    policy, moments = make_policy(config, prepared.spaces), _moments(data, config)
+    policy = make_policy(config, prepared.spaces)
+    moments = _moments(data, config, prepared.spaces.normalized)
+    data = data._replace(action=from_env(policy.distribution, data.action))
     arrays: dict[str, np.ndarray] = {}
     figures: dict[str, Any] = {}
     made: dict[Any, Any] = {}
@@ -95,23 +99,6 @@ def clone_members(
     return arrays, origin
 
 
-def _check_kind(prepared: Prepared) -> None:
-    """Refuses a policy that was not tried here.
-
-    Raises:
-      BadInput: naming the setting.
-    """
-    config, spaces = prepared.config, prepared.spaces
-    kinds = {
-        "action masks": spaces.mask > 0,
-        "pictures among other parts": bool(spaces.pictures),
-        f"distribution {config.distribution}": spaces.action_kind == "continuous"
-        and config.distribution != "gaussian",
-    }
-    if found := [kind for kind, is_there in kinds.items() if is_there]:
-        raise BadInput(f"init_from: data:... is not supported with {found[0]}")
-
-
 def _read(prepared: Prepared) -> Demonstrations:
     config, spaces = prepared.config, prepared.spaces
     name, text = config.init_from, config.init_from.removeprefix(DATA)
@@ -127,13 +114,17 @@ def _read(prepared: Prepared) -> Demonstrations:
         close(made)
 
 
-def _moments(data: Demonstrations, config: Config) -> Moments | None:
-    """Mean and variance of all observations; None if nothing is normalised."""
+def _moments(data: Demonstrations, config: Config, size: int) -> Moments | None:
+    """Mean and variance of the observations' first `size` numbers; None if nothing is normalised.
+
+    Pictures beside them have none.
+    """
     from sauna.algorithm.policy.normalize import Moments
 
     if not config.normalize_observations:
         return None
-    seen = np.concatenate([data.observation, data.final]).astype(np.float64)
+    every = np.concatenate([data.observation, data.final])
+    seen = every[:, :size].astype(np.float64)
     return Moments(seen.mean(0), seen.var(0), np.array([float(len(seen))]))
 
 

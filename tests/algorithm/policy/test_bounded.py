@@ -9,7 +9,15 @@ import pytest
 from scipy import stats
 from scipy.special import betaln, expit
 
-from sauna.algorithm.policy.bounded import TRIES, beta, log_slope, squashed, to_env
+from sauna.algorithm.policy.bounded import (
+    INSIDE,
+    TRIES,
+    beta,
+    from_env,
+    log_slope,
+    squashed,
+    to_env,
+)
 from sauna.algorithm.policy.distributions import Distribution, gaussian
 
 LOG_2 = np.log(2.0)
@@ -178,3 +186,13 @@ def test_the_deterministic_action_is_the_median_and_the_mean() -> None:
 def test_what_is_not_bounded_goes_to_the_environment_as_it_is() -> None:
     action = np.array([[3.0]], np.float32)
     assert to_env(gaussian(1), action) is action
+
+
+def test_an_action_of_the_environment_is_held_as_what_gives_it_again() -> None:
+    action = np.array([[-0.9, 0.0], [0.3, 0.998], [-1.0, 1.0]], np.float32)
+    held = from_env(beta(2), action)
+    again = to_env(beta(2), held)
+    np.testing.assert_allclose(again[:2], action[:2], rtol=1e-5)
+    np.testing.assert_allclose(again[2], [-INSIDE, INSIDE], rtol=1e-5)
+    assert np.abs(held - action).max() > 1
+    np.testing.assert_array_equal(from_env(gaussian(2), action), action)

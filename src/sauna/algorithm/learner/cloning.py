@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.types import Array
 from sauna.config.settings import Config
@@ -129,17 +130,21 @@ def _fit(params: Array, rows: Rows, *, policy: Policy, value_coef: float) -> Fit
     if rows.action.dtype == jnp.int32:
         agreement = jnp.mean(jnp.all(mode == rows.action, -1))
     else:
-        agreement = _explained(rows.action, mode)
+        agreement = _explained(to_env(distribution, rows.action), to_env(distribution, mode))
     error = jnp.mean((value - target) ** 2) / _scale(target)
     likelihood = jnp.mean(log_prob)
     return Fit(value_coef * error - likelihood, likelihood, agreement, jnp.sqrt(error))
 
 
 def _explained(true: Array, guess: Array) -> Array:
-    """`1 - sum((x - y)^2) / sum((x - mean x)^2)` of `[M, A]`; 0 if `x` is constant."""
+    """`1 - sum((x - y)^2) / sum((x - mean x)^2)` of `[M, A]`; 0 if `x` is constant.
+
+    A spread that the mean's rounding makes is none.
+    """
     spread = jnp.sum((true - jnp.mean(true, 0)) ** 2)
-    share = jnp.sum((true - guess) ** 2) / jnp.where(spread > 0, spread, 1.0)
-    return jnp.where(spread > 0, 1.0 - share, 0.0)
+    varies = spread > 1e-10 * jnp.sum(true**2)
+    share = jnp.sum((true - guess) ** 2) / jnp.where(varies, spread, 1.0)
+    return jnp.where(varies, 1.0 - share, 0.0)
 
 
 def clone_order(number: int, seed: int, epoch: int) -> np.ndarray:

@@ -21,6 +21,7 @@ from sauna.algorithm.policy.distributions import Distribution, gaussian
 from sauna.algorithm.types import Array
 
 NODES = 32  # of the Gauss-Hermite rule for the squashed Gaussian's entropy
+INSIDE = 0.999  # the largest action that a recorded one stands for
 TRIES = 6  # proposals of one gamma variate: 5% of them fail at most, so 2e-8 of the variates do
 
 
@@ -33,6 +34,17 @@ def to_env(distribution: Distribution, action: Any) -> Any:
     if not distribution.bounded:
         return action
     return np.tanh(action) if isinstance(action, np.ndarray) else jnp.tanh(action)
+
+
+def from_env(distribution: Distribution, action: np.ndarray) -> np.ndarray:
+    """Returns how a rollout holds an action `[..., A]` of the environment's border.
+
+    It is the inverse of `to_env`. An action at a bound, which no `u` has, counts as one inside it
+    (`INSIDE`).
+    """
+    if not distribution.bounded:
+        return action
+    return np.arctanh(np.clip(action, -INSIDE, INSIDE))
 
 
 def log_slope(u: Array) -> Array:
