@@ -117,11 +117,12 @@ def until(true: Callable[[], Any], seconds: float = 300) -> None:
 
 
 def kept(folder: Path) -> dict[str, bytes]:
-    """What of a study or a tuning does not depend on a clock."""
+    """What of a study or a tuning depends neither on a clock nor on the folder's own name."""
     files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".png"]
     apart = ("timing.jsonl", "metrics.csv", "manifest.json", ".lock", "stderr.txt", "report.html")
     found = {str(p.relative_to(folder)): p for p in sorted(files) if p.name not in apart}
-    return {name: timeless(path) for name, path in found.items()}
+    own = str(folder).encode()
+    return {name: timeless(path).replace(own, b"runs") for name, path in found.items()}
 
 
 def timeless(path: Path) -> bytes:

@@ -228,7 +228,7 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (path / "mine.toml").write_text(STUDY.format(steps=STEPS))
     (path / "local").mkdir()
     subprocess.run(
-        [sys.executable, "-m", "sauna", "study", "../mine.toml", "--processes=2"],
+        [sys.executable, "-m", "sauna", "study", "../mine.toml", "--trust", "--processes=2"],
         cwd=path / "local",
         env=environment(),
         check=True,
@@ -244,7 +244,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
 
 
 def start(place: Place, *arguments: str, folder: str, **changed: str) -> subprocess.Popen[str]:
-    return place.start("study", "../mine.toml", *arguments, folder=folder, **changed)
+    return place.start("study", "../mine.toml", "--trust", *arguments, folder=folder, **changed)
 
 
 @slow
@@ -305,7 +305,7 @@ def test_stopped_here_and_continued_on_this_machine(
     assert place.listening() and place.listening() <= LOOPBACK
     started.send_signal(number)
     said = place.finish(started, code)
-    assert "continue with: sauna study ../mine.toml --on ray" in said
+    assert "continue with: sauna study ../mine.toml --trust --on ray" in said
     until(lambda: not place.processes(), 60)
     assert not list((place.path / "nodes").iterdir())
     saved = [json.loads(p.read_text()) for p in runs.glob("units/*/run/summary.json")]
