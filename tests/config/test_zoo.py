@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 
+from command_line import sauna_here
 from sauna.config.presets import PRESETS, arm_config, overrides_of, resolve, resolve_run
 from sauna.config.settings import Config
 from sauna.config.task_presets import TASK_PRESET_HELP, TASK_PRESETS
@@ -95,6 +96,12 @@ def test_other_names_are_not_in_the_zoo(env: str) -> None:
 def test_auto_leaves_another_algorithm_alone() -> None:
     a2c = {"env": "CartPole-v1", "algorithm": "a2c", "preset": AUTO}
     assert resolve(a2c) == resolve({"env": "CartPole-v1", "algorithm": "a2c"})
+
+
+def test_an_unknown_algorithm_is_refused_by_its_name() -> None:
+    done = sauna_here("train", "CartPole-v1", "--arm", "sauna", "--algorithm", "a2c_")
+    known = "unknown value 'a2c_' (known: ppo, a2c); did you mean 'a2c'?"
+    assert (done.returncode, done.stderr) == (2, f"sauna: algorithm: {known}\n")
 
 
 def test_nothing_but_auto_looks_into_the_zoo() -> None:

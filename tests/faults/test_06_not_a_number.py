@@ -203,7 +203,7 @@ class OnDevice:
         what = "reward" if kwargs["field"] == "reward" else "observation"
         wanted = (
             f"environment {env} of ppo/0, iteration {iteration}, step {row} of the rollout: "
-            f"{what} is not finite"
+            f"{what} is not finite or beyond 1e+18"
         )
         message = "it got through"
         for i in np.flatnonzero(reports.ran):

@@ -49,6 +49,7 @@ def experiment(kills: int, seed: int, place: Path) -> Result:
         "--out",
         str(place / "out"),
         "--processes=2",
+        "--trust",
     ]
     for _ in range(kills):
         _kill(command, place, rng, tally)

@@ -217,10 +217,10 @@ def chosen_preset(parsed: Mapping[str, Any]) -> str:
     `auto` is the environment's, with A2C the first one.
 
     Raises:
-      BadInput: there is no such preset, it is another algorithm's than the one named, or `auto`
-        knows nothing of the environment.
+      BadInput: there is no such preset or algorithm, the preset is another algorithm's than the one
+        named, or `auto` knows nothing of the environment.
     """
-    algorithm = parsed.get("algorithm")
+    algorithm = parse("algorithm", parsed["algorithm"]) if "algorithm" in parsed else None
     entry = entry_for(parsed)
     preset = entry.preset if entry else parsed.get("preset", AUTO)
     if preset == AUTO:
