@@ -1,4 +1,4 @@
-"""Makes the zoo, `src/sauna/zoo/`, of runs that `results/zoo.py` or `sauna train ENV` left.
+"""Makes the zoo, `src/sauna/training/zoo/`, of runs that `results/zoo.py` or `sauna train` left.
 
     python results/zoo_policies.py runs/zoo                     every complete run in the folder
     python results/zoo_policies.py runs/zoo --only Hopper-v5    these alone
@@ -22,7 +22,7 @@ from sauna.experiments.run_list import find_runs
 from sauna.experiments.share.card import placed
 from sauna.system import run_directory
 
-ZOO = Path(__file__).parent.parent / "src" / "sauna" / "zoo"
+ZOO = Path(__file__).parent.parent / "src" / "sauna" / "training" / "zoo"
 LARGEST = 200_000  # bytes of a policy's folder
 
 

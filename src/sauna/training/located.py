@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,7 +47,7 @@ def locate(run: str | Path) -> Located:
 
 def zoo() -> dict[str, Path]:
     """The policies that come with this package: `name -> folder`."""
-    folder = Path(str(files("sauna"))) / "zoo"
+    folder = Path(__file__).parent / "zoo"
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     return {path.name: path for path in found if (path / "policy.json").is_file()}
 
