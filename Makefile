@@ -3,7 +3,7 @@
 # make test   install into .venv, run the tests
 # make test-faults  a few tries of every fault of docs/concepts/reliability.md
 # make test-newest  both with the newest versions of all packages, in .venv-newest
-# make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, Playground)
+# make test-slow  the tests that take minutes; installs what they need besides (Ray, Brax, ONNX ...)
 # make campaign  every fault of docs/concepts/reliability.md in full (hours; continues where it stopped)
 # make mutants   plants mistakes in algorithm/ and counts those that the tests catch
 # make soak      two hours of a long run: do memory and open files stay flat?
@@ -45,7 +45,7 @@ $(VENV)/.ci: $(BIN)/python pyproject.toml constraints.txt
 	@touch $@ $(VENV)/.dev $(VENV)/.run
 
 $(VENV)/.slow: $(BIN)/python pyproject.toml constraints.txt
-	$(INSTALL) '.[dev,docs,cluster,brax,playground]'
+	$(INSTALL) '.[dev,docs,cluster,brax,playground,onnx,minari,parquet,hub,pettingzoo]'
 	@$(COMPILE)
 	@touch $@ $(VENV)/.ci $(VENV)/.dev $(VENV)/.docs $(VENV)/.run
 

@@ -93,7 +93,8 @@ def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
     assert len((tmp_path / "policy.py").read_text().splitlines()) <= 100
 
 
-@pytest.mark.parametrize("kind", EVERY)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
 def test_onnx_acts_as_the_policy(kind: str) -> None:
     pytest.importorskip("onnxruntime", reason="needs `pip install 'sauna-rl[onnx]'`")
     policy, graph = policy_of(kind)
