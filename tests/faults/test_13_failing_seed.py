@@ -144,7 +144,10 @@ class _Pretended(Executor):
                 raise KeyboardInterrupt
             self._end(name, "RuntimeError: out of luck")
 
-    def _tell_to_stop(self) -> None:
+    def _stop_all(self) -> None:
+        pass
+
+    def _stop_one(self, name: str) -> None:
         pass
 
     def _close(self) -> None:

@@ -55,10 +55,10 @@ class Broken(Executor):
                 )
             self._end(name, "broken")
 
-    def _tell_to_stop(self) -> None:
+    def _stop_all(self) -> None:
         pass
 
-    def _tell_one_to_stop(self, name: str) -> None:
+    def _stop_one(self, name: str) -> None:
         self.stopped.append(name)
 
     def _close(self) -> None:

@@ -68,10 +68,10 @@ class Executor(ABC):
             while self._waiting or self._running:
                 if self._stopping():
                     self._waiting.clear()
-                    self._tell_to_stop()
+                    self._stop_all()
                 for name, unit in self._running.items():
                     if self._enough(unit):
-                        self._tell_one_to_stop(name)
+                        self._stop_one(name)
                 self._fill()
                 self._pump()
                 self._view.refresh()
@@ -90,11 +90,11 @@ class Executor(ABC):
         """Handles what has arrived within a moment; `_end` is called for each unit that ended."""
 
     @abstractmethod
-    def _tell_to_stop(self) -> None:
+    def _stop_all(self) -> None:
         """Lets every running unit finish its iteration and save; may be called again."""
 
     @abstractmethod
-    def _tell_one_to_stop(self, name: str) -> None:
+    def _stop_one(self, name: str) -> None:
         """Lets the running unit `name` finish its iteration and save; may be called again."""
 
     @abstractmethod

@@ -51,15 +51,15 @@ class LocalExecutor(Executor):
         except queue.Empty:
             return
 
-    def _tell_to_stop(self) -> None:
+    def _stop_all(self) -> None:
         for process in self._processes.values():
             process.stop()
 
-    def _tell_one_to_stop(self, name: str) -> None:
+    def _stop_one(self, name: str) -> None:
         self._processes[name].stop()
 
     def _close(self) -> None:
-        self._tell_to_stop()
+        self._stop_all()
         for process in self._processes.values():
             if self._hurry:
                 process.kill()

@@ -240,7 +240,7 @@ class RayExecutor(Executor):
         self._began.add(unit.name)
         self._hub.answer.remote(unit.name, files)
 
-    def _tell_to_stop(self) -> None:
+    def _stop_all(self) -> None:
         if not self._told:
             self._told = True
             self._hub.stop.remote()
@@ -248,7 +248,7 @@ class RayExecutor(Executor):
                 if name not in self._began:  # Ray has no core for it yet
                     self._ray.cancel(ref)
 
-    def _tell_one_to_stop(self, name: str) -> None:
+    def _stop_one(self, name: str) -> None:
         if name not in self._told_one:
             self._told_one.add(name)
             self._hub.stop_one.remote(name)
