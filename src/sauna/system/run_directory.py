@@ -81,6 +81,14 @@ def _seeds_name(seeds: tuple[int, ...]) -> str:
     return f"{len(seeds)}seeds"
 
 
+def _run_below(folder: Path) -> str:
+    """Where the runs of a unit, or of a comparison, are; empty if there are none."""
+    if (folder / "run" / "config.json").is_file():
+        return f"; did you mean {folder / 'run'}?"
+    units = folder.parent / "units"
+    return f"; its runs are {units}/*/run" if (folder / "results.json").is_file() else ""
+
+
 def create(path: Path, new: bool = False) -> None:
     """Makes an empty run directory.
 
@@ -91,8 +99,11 @@ def create(path: Path, new: bool = False) -> None:
     if new and path.exists():
         raise FileExistsError(path)
     if path.exists() and (not path.is_dir() or any(map(_counts, path.iterdir()))):
-        again = f"; `sauna resume {shlex.quote(str(path))}` continues it"
-        hint = again if (path / "config.json").exists() else ""
+        resume, hint = f"sauna resume {shlex.quote(str(path))}", ""
+        if (path / "config.json").exists():
+            hint = f"; `{resume}` continues it"
+            if is_complete(path):
+                hint = f"; `{resume} --steps N` trains this finished run further"
         raise BadInput(f"out: {path} is not empty{hint}")
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
@@ -192,7 +203,7 @@ def read_config(
                 f"{run} is an exported policy, and no run: it can be played (sauna eval) and "
                 f"trained further (--init-from)"
             )
-        raise BadInput(f"{run} is not a run directory (it has no config.json)")
+        raise BadInput(f"{run} is not a run directory (it has no config.json){_run_below(run)}")
     stored = _read(path)
     for name, kind in _PARTS.items():
         missing = None if name in needed else kind()

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from sauna.config.presets import Member
 from sauna.config.settings import Config
-from sauna.training.summary import with_evaluation
+from sauna.training.summary import WINDOW, with_evaluation
 
 PLAIN_SECONDS = 10.0  # between two progress lines where there is no terminal
 NOTEBOOK_SECONDS = 0.5  # between two drawings of the table in a notebook
@@ -180,9 +180,11 @@ class PlainDisplay:
 
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
         for name, row in members.items():
+            episodes = row.get("episodes", WINDOW)
+            which = f"last {WINDOW}" if episodes >= WINDOW else f"all {episodes}"
             self.say(
                 f"{name}: return {number(row, 'return_mean', '.2f')} "
-                f"(training, last 100 episodes), {row['env_steps']:,} env steps, "
+                f"(training, {which} episodes), {row['env_steps']:,} env steps, "
                 f"{row['kept_steps']:,} kept{evaluated(row)}"
             )
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-METRIC = "return_mean: mean training return (sampled actions) of the last 100 episodes"
+WINDOW = 100  # episodes that the reported mean return covers, as in baselines and the paper
+METRIC = f"return_mean: mean training return (sampled actions) of the last {WINDOW} episodes"
 STOPS = ("", "stop_at", "stop_when_flat", "callback")  # what may stop a member early
 KEPT = (
     "arm",

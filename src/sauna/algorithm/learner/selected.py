@@ -248,7 +248,7 @@ def _epoch(
     steps = minibatch_count(mode, drawn.number, size, config.minibatches)
     kept = drawn.number * length
     if choice.probability is None:
-        kept = jnp.sum(choice.keep, dtype=jnp.int32)
+        kept = jnp.minimum(kept, jnp.sum(choice.keep, dtype=jnp.int32))
     totals = totals._replace(drawn=totals.drawn + kept, epochs=totals.epochs + 1)
     batch = _standardized(batch, choice, config)
     part_of: Callable[[Array, Array], Minibatch]

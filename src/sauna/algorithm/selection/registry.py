@@ -1,7 +1,7 @@
 """Which rule a name means, at each stage.
 
 `config/` names each rule, too, so that bad input is refused without JAX: `SAMPLERS` and the other
-choices of `options.py`, and `ARMS`. See "Add a built-in rule" in docs/concepts/architecture.md.
+choices of `choices.py`, and `ARMS`. See "Add a built-in rule" in docs/concepts/architecture.md.
 """
 
 from __future__ import annotations

@@ -82,8 +82,9 @@ def _sampler_notes(found: Inspection) -> list[str]:
         rate = found.last.get("sample_rate")
         trained = "" if rate is None else f"; sample rate in the last iteration {rate:.3f}"
         verb = words(found)[0]
+        who = "Sampler" if config.control == "none" else f"Control {config.control} of the sampler"
         said.append(
-            f"Sampler {config.sampler}: {share:.3f} of these steps are {verb} in the first epoch "
+            f"{who} {config.sampler}: {share:.3f} of these steps are {verb} in the first epoch "
             f"of a rollout{trained}. It decides about whole rollouts: {config.rollout_steps:,} "
             f"steps of {_environments(config.envs)}. Those behind the last episode are played and "
             f"not shown."

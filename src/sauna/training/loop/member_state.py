@@ -25,8 +25,7 @@ from sauna.algorithm.types import Replay, Rollout, TrainState
 from sauna.envs.host.contract import HostEnvs
 from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.system.errors import SaunaError
-
-WINDOW = 100  # episodes that the reported mean return covers, as in baselines and the paper
+from sauna.training.summary import WINDOW
 
 
 class NotRestored(SaunaError):
