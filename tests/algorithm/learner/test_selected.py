@@ -183,6 +183,12 @@ def test_each_step_learns_from_the_rows_that_numpy_says(
     np.testing.assert_allclose(metrics.work.sample_rate, 10 / 24)
 
 
+def test_rows_kept_beyond_the_share_are_neither_learned_from_nor_counted(given: Given) -> None:
+    _, metrics = learner(given, share=0.5)(EVERY, NEVER)
+    assert metrics.work.samples_backward == EPOCHS * ROWS / 2
+    assert metrics.work.sample_rate == 0.5
+
+
 def test_nothing_kept_changes_nothing(given: Given, fewer: Any) -> None:
     state, metrics = fewer(NONE, NEVER)
     for new, old in zip(jax.tree.leaves(state[:2]), jax.tree.leaves(given.state[:2]), strict=True):
