@@ -37,7 +37,7 @@ from zoo_page import draw_zoo, zoo_page
 
 from sauna.experiments.report.figures import draw_plots, write_figures
 from sauna.experiments.report.page import rounded
-from sauna.experiments.study.results import cell_command, gather
+from sauna.experiments.study.results import cell_command, each_once, gather
 from sauna.experiments.study.spec import Spec, load_spec
 from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.units import units_of
@@ -132,18 +132,16 @@ def merged(old: dict[str, Any], new: dict[str, Any], spec: Spec) -> dict[str, An
         if _is_of(spec, cell)
     }
     order = [(task, arm.label) for task in spec.tasks for arm in spec.arms]
-    made_with = {key: _each(old.get(key, []), new[key]) for key in ("versions", "machine", "git")}
+    made_with = {
+        key: each_once([*_listed(old.get(key, [])), *_listed(new[key])])
+        for key in ("versions", "machine", "git")
+    }
     return {**new, **made_with, "cells": [cells[key] for key in order if key in cells]}
 
 
-def _each(*found: Any) -> Any:
-    """Each value of several once, in a list; one value alone stands without a list."""
-    values: list[Any] = []
-    for given in found:
-        for value in given if isinstance(given, list) else [given]:
-            if value not in values:
-                values.append(value)
-    return values[0] if len(values) == 1 else values
+def _listed(value: Any) -> list[Any]:
+    """What `each_once` was given, as far as it differed."""
+    return value if isinstance(value, list) else [value]
 
 
 def _is_of(spec: Spec, cell: dict[str, Any]) -> bool:

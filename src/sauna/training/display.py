@@ -180,7 +180,7 @@ class PlainDisplay:
 
     def summary(self, members: dict[str, dict[str, Any]]) -> None:
         for name, row in members.items():
-            episodes = row.get("episodes", WINDOW)
+            episodes = row["episodes"]
             which = f"last {WINDOW}" if episodes >= WINDOW else f"all {episodes}"
             self.say(
                 f"{name}: return {number(row, 'return_mean', '.2f')} "

@@ -158,7 +158,7 @@ def study(
       address: of the cluster.
       quiet: show nothing.
       accept_changed_code: take runs of before as they are, even if their code is not what it was.
-      notes: lists what is to be said before anything is trained.
+      notes: lists the lines that are printed before anything is trained.
 
     Returns:
       the summary.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +64,17 @@ def _made_with(units: list[Unit], folder: Path) -> dict[str, Any]:
             path = part.run(folder) / "config.json"
             stored = run_directory.read_config_file(path) if path.is_file() else {}
             for name, values in found.items():
-                if name in stored and stored[name] not in values:
-                    values.append(stored[name])
-    return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
+                values += [stored[name]] if name in stored else []
+    return {name: each_once(values) for name, values in found.items()}
+
+
+def each_once(values: Iterable[Any]) -> Any:
+    """Lists values that differ, each once; one alone stands without a list."""
+    found: list[Any] = []
+    for value in values:
+        if value not in found:
+            found.append(value)
+    return found[0] if len(found) == 1 else found
 
 
 def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any]:

@@ -2,9 +2,9 @@
 
     batches/0003/units/trial-14/run   the run of one trial
 
-Optuna is asked and told on this machine alone, batch by batch, so the trials are those of a search
-that trains here. What a trial scores on its way arrives a moment later than here: one that is
-pruned has taken a few more env steps when it stops.
+Optuna proposes trials and takes their scores on this machine alone, batch by batch, so the trials
+are those of a search that trains here. What a trial scores on its way arrives a moment later than
+here: one that is pruned has taken a few more env steps when it stops.
 """
 
 from __future__ import annotations

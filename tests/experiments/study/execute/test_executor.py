@@ -41,6 +41,9 @@ class Broken(Executor):
         self.stopped: list[str] = []
         self._left = list(crashes)
 
+    def _open(self) -> None:
+        pass
+
     def _start(self, unit: Unit) -> None:
         self.starts[unit.name] += 1
 

@@ -64,6 +64,7 @@ class Executor(ABC):
         """Runs every unit that is neither complete nor failed; returns when all are, or stopped."""
         everything = [part for unit in units for part in parts(unit, self._folder)]
         self._waiting = [unit for unit in everything if not self._is_over(unit)]
+        self._open()
         try:
             while self._waiting or self._running:
                 if self._stopping():
@@ -80,6 +81,10 @@ class Executor(ABC):
             raise
         finally:
             self._close()
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Makes what units are run with."""
 
     @abstractmethod
     def _start(self, unit: Unit) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable
-from pathlib import Path
 
-from sauna.experiments.study.execute.executor import Executor, View, never
+from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.process import Message, UnitProcess
 from sauna.experiments.study.units import Unit
 from sauna.system.safe_write import own_folder
@@ -15,15 +13,7 @@ from sauna.system.safe_write import own_folder
 class LocalExecutor(Executor):
     """Runs units in `jobs` processes at a time."""
 
-    def __init__(
-        self,
-        folder: Path,
-        jobs: int,
-        view: View,
-        stopping: Callable[[], bool],
-        enough: Callable[[Unit], bool] = never,
-    ) -> None:
-        super().__init__(folder, jobs, view, stopping, enough)
+    def _open(self) -> None:
         self._messages: queue.SimpleQueue[tuple[str, Message | None]] = queue.SimpleQueue()
         self._processes: dict[str, UnitProcess] = {}
         self._errors: dict[str, str] = {}

@@ -13,7 +13,7 @@ import secrets
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from typing import IO, Any
 from sauna import __version__
 from sauna.config.trust import seal
 from sauna.experiments.study.execute import ray_files
-from sauna.experiments.study.execute.executor import Executor, View, never
+from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.ray_node import Hub, Said, run_unit, version
 from sauna.experiments.study.units import Unit
 from sauna.system import run_directory
@@ -148,15 +148,7 @@ def _cores() -> int:
 class RayExecutor(Executor):
     """Runs units as Ray tasks of one core each; needs a connection, see `connected`."""
 
-    def __init__(
-        self,
-        folder: Path,
-        jobs: int,
-        view: View,
-        stopping: Callable[[], bool],
-        enough: Callable[[Unit], bool] = never,
-    ) -> None:
-        super().__init__(folder, jobs, view, stopping, enough)
+    def _open(self) -> None:
         import ray
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy as On
 
@@ -171,8 +163,8 @@ class RayExecutor(Executor):
         self._began: set[str] = set()
         self._locks: dict[str, IO[str]] = {}
         self._git = run_directory.git_revision()
-        self._told = False
-        self._told_one: set[str] = set()
+        self._stopped = False
+        self._stopped_units: set[str] = set()
 
     def _start(self, unit: Unit) -> None:
         run = unit.run(self._folder)
@@ -241,16 +233,16 @@ class RayExecutor(Executor):
         self._hub.answer.remote(unit.name, files)
 
     def _stop_all(self) -> None:
-        if not self._told:
-            self._told = True
+        if not self._stopped:
+            self._stopped = True
             self._hub.stop.remote()
             for ref, name in self._tasks.items():
                 if name not in self._began:  # Ray has no core for it yet
                     self._ray.cancel(ref)
 
     def _stop_one(self, name: str) -> None:
-        if name not in self._told_one:
-            self._told_one.add(name)
+        if name not in self._stopped_units:
+            self._stopped_units.add(name)
             self._hub.stop_one.remote(name)
 
     def _close(self) -> None:
