@@ -19,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ from zoo_page import draw_zoo, zoo_page
 from sauna.experiments.report.figures import draw_plots, write_figures
 from sauna.experiments.report.page import rounded
 from sauna.experiments.study.results import cell_command, each_once, gather
-from sauna.experiments.study.spec import Spec, load_spec
+from sauna.experiments.study.spec import Spec, built_in, load_spec
 from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.units import units_of
 
@@ -92,8 +91,8 @@ def remaining(name: str) -> Path | str | None:
         return name if tasks else None
     path = ROOT / "runs" / f"{name}.toml"
     path.parent.mkdir(exist_ok=True)
-    text = (resources.files("sauna.experiments.study.studies") / f"{name}.toml").read_text()
-    path.write_text(re.sub(r"^tasks = .*$", f"tasks = {json.dumps(tasks)}", text, flags=re.M))
+    own = f"tasks = {json.dumps(tasks)}"
+    path.write_text(re.sub(r"^tasks = .*$", own, built_in()[name], flags=re.M))
     return path
 
 
