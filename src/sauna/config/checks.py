@@ -315,7 +315,7 @@ def budget_note(config: Config) -> str:
 
 def cautions(config: Config) -> list[str]:
     """Says what can be trained with, but seldom is meant."""
-    found = []
+    found: list[str] = []
     size = config.rollout_steps * config.envs // config.minibatches
     if not config.normalize_advantages or config.algorithm != "ppo":
         return found
