@@ -63,6 +63,27 @@ def test_each_observation_is_the_one_before_its_action(run, kept) -> None:
     np.testing.assert_array_equal(kept[0].observation, np.stack(seen))
 
 
+@pytest.mark.parametrize("by", ["info", "method"])
+def test_masks_are_recorded_beside_the_observations(tmp_path, kept, by) -> None:
+    """Playing the actions again gives the same masks, in which each action is valid."""
+    from sauna.envs.make import make_env
+
+    kwargs = {"several": True, "by": by}
+    settings = {**SETTINGS, "env_kwargs": kwargs, "action_mask": True, "seeds": 1}
+    sauna.train("small_envs:Choosy", quiet=True, out=tmp_path / "run", **settings)
+    sauna.record(tmp_path / "run", "a.parquet", episodes=2, say=lambda text: None)
+    env = make_env("small_envs:Choosy", kwargs)
+    for seed, one in enumerate(kept):
+        seen, masks = [env.reset(seed=seed)[0]], [env.valid]
+        for action in one.action:
+            seen.append(env.step(action)[0])  # which raises at an action that is not valid
+            masks.append(env.valid)
+        np.testing.assert_array_equal(one.observation, np.stack(seen))
+        assert one.mask is not None and one.mask.shape == (len(one.action) + 1, 5)
+        np.testing.assert_array_equal(one.mask[:-1], np.stack(masks)[:-1])
+        assert one.mask[-1].all() and not one.mask[:-1].all()
+
+
 def test_what_cannot_be_recorded_is_refused(run, tmp_path) -> None:
     for to, more, message in (
         ("a.csv", {}, "neither minari:NAME nor a file that ends in .parquet"),

@@ -14,7 +14,7 @@ from helpers import SMALL, equal, make_job, policy_output, train_here
 from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import make_policy
-from sauna.envs.spaces import describe, observation_reader
+from sauna.envs.spaces import Spaces, describe, observation_reader
 from sauna.system import run_directory
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
@@ -186,8 +186,13 @@ def test_what_cannot_be_cloned_is_refused_in_a_line(tmp_path: Path, monkeypatch)
     fresh = {"init_normalizer": "fresh"}
     with pytest.raises(BadInput, match="fresh would show a clone what it was not fitted to"):
         initial(ENV, **fresh)
-    with pytest.raises(BadInput, match="has no action masks"):
-        initial("small_envs:Choosy", action_mask=True)
+    seen, choice = np.zeros((20, 4)), np.zeros(20, int)
+    seen[:, 1:3] = 1
+    choice[7] = 2
+    spaces = Spaces("vector", (4,), "discrete", (3,), (), (), mask=3)
+    episodes = [Stored(seen, seen[0], choice, seen[:, 0], True)] * 2
+    with pytest.raises(BadInput, match="the action of row 7 is not valid by its action_mask"):
+        demonstrations(episodes, spaces, small_envs.spaces.Discrete(3), False, NAME)
     with pytest.raises(BadInput, match="clone_epochs: not read"):
         sauna.train(ENV, out=tmp_path / "run", quiet=True, **{**SETTINGS, "init_from": "RUN"})
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from sauna.config.imported_from import names_the_folder
 from sauna.envs.host.answers import close, one_number
 from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
+from sauna.envs.shapes import mask_in
 from sauna.envs.wrapping import PLAIN, Wrapping, wrapping_of
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.evaluate.episodes import kwargs_of, provided, statistics
@@ -81,8 +82,6 @@ def record(
         raise BadInput(f"to: {to!r} is neither minari:NAME nor a file that ends in .parquet")
     to = to if to.startswith(MINARI) else str(Path.cwd() / to)
     artifact = load_artifact(run, say, checkpoint, trust=trust)
-    if artifact.config.action_mask:
-        raise BadInput("record: a data set has no place for action masks")
     env = provided(run, env, parts)
     name = find_member(artifact.members, 0 if member is None else member)
     kwargs, chosen = kwargs_of(artifact, env, env_kwargs), env or artifact.config.env
@@ -151,14 +150,21 @@ class _Listener:
     def recorded(self, seed: int) -> Recorded:
         """The episode so far; one that has not ended counts as truncated."""
         actions, rewards, terminated, truncated = zip(*self._steps, strict=True)
-        ended = terminated[-1]
+        ended, observations, masks = terminated[-1], self._observations, None
+        size, space = mask_in(self._env.observation_space)
+        if size:
+            from sauna.envs.masked import MASK, OBSERVATION
+
+            masks = np.stack([one[MASK] for one in observations])
+            observations = [one[OBSERVATION] for one in observations]
         return Recorded(
             seed,
-            _stacked(self._env.observation_space, self._observations),
+            _stacked(space, observations),
             np.stack([np.asarray(action) for action in actions]),
             np.array(rewards),
             ended,
             truncated[-1] or not ended,
+            masks,
         )
 
 

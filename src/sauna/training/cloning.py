@@ -62,8 +62,6 @@ def clone_members(
     """
     config = prepared.config
     name = config.init_from
-    if prepared.spaces.mask:
-        raise BadInput("init_from: data:... has no action masks, which this policy acts by")
     if config.init_normalizer == "fresh" and config.normalize_observations:
         raise BadInput("init_normalizer: fresh would show a clone what it was not fitted to")
     data = _read(prepared)

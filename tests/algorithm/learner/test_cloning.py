@@ -40,10 +40,12 @@ def cloned(data: Rows, kind: str, sizes: tuple[int, ...]) -> Fit:
     return cloned_alike([data], kind, sizes, 60)[0]
 
 
-def cloned_alike(each: list[Rows], kind: str, sizes: tuple[int, ...], epochs: int) -> list[Fit]:
-    """The same for several data of one shape."""
+def cloned_alike(
+    each: list[Rows], kind: str, sizes: tuple[int, ...], epochs: int, mask: int = 0
+) -> list[Fit]:
+    """The same for several data of one shape, whose last `mask` numbers say what is valid."""
     config = configured(hidden="16", clone_learning_rate=1e-2, init_from="data:x")
-    spaces = Spaces("vector", each[0].observation.shape[1:], kind, sizes, (), ())
+    spaces = Spaces("vector", each[0].observation.shape[1:], kind, sizes, (), (), mask=mask)
     policy = make_policy(config, spaces)
     cloner: Cloner = make_cloner(config, policy, 0.5)
     fits = []
@@ -79,6 +81,25 @@ def test_where_all_look_alike_the_frequencies_of_actions_are_learned() -> None:
     # V is the mean, 3.25: what is left is the spread about it.
     left = math.sqrt(0.1875 / (0.25 * 16 + 0.75 * 9))
     assert abs(float(fit.value_error) - left) < 0.01
+
+
+def test_only_valid_actions_count_into_the_likelihood() -> None:
+    """Where 0 and 1 are valid, 3 of 4 actions are 0; where 0 and 2 are, each second one is.
+
+    So the policy of largest likelihood has 3:1:3, and two entropies are what it leaves. Without
+    masks the same actions are 5, 1 and 2 of 8.
+    """
+    number = np.arange(SIZE)
+    first = number % 2 == 0
+    action = np.where(first, number % 8 == 0, 2 * (number % 4 == 1)).astype(np.int32)[:, None]
+    mask = np.where(first[:, None], [1, 1, 0], [1, 0, 1])
+    seen = np.concatenate([np.ones((SIZE, 1)), mask], 1)
+    masked = cloned_alike([rows(seen, action, number * 0.0)], "discrete", (3,), 60, mask=3)[0]
+    plain = cloned(rows(seen[:, :1], action, number * 0.0), "discrete", (3,))
+    quarter = 0.25 * math.log(0.25) + 0.75 * math.log(0.75)
+    assert abs(float(masked.log_likelihood) - (quarter + math.log(0.5)) / 2) < 0.005
+    eighths = sum(n / 8 * math.log(n / 8) for n in (5, 1, 2))
+    assert abs(float(plain.log_likelihood) - eighths) < 0.005
 
 
 def test_a_rule_is_learned_and_noise_is_not() -> None:

@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sauna
 import small_envs
+from helpers import SMALL
 from sauna.envs.make import make_env
 from sauna.envs.spaces import action_writer, describe
 from sauna.experiments.record import _Listener, _writer
 from sauna.system.errors import BadInput
+from sauna.system.run_directory import read_config
 from sauna.training.cloning import _read
 from sauna.training.data.minari_sets import read_minari
 from sauna.training.data.parquet import read_parquet
@@ -30,6 +33,7 @@ def extras() -> None:
         pytest.importorskip(name, reason="needs `pip install 'sauna-rl[minari,parquet]'`")
 
 
+MASKED: dict[str, Any] = {"env_kwargs": {"by": "method"}, "action_mask": True}
 KINDS: dict[str, dict[str, Any]] = {
     "small_envs:Scripted": {},
     "small_envs:Picture": {},
@@ -40,8 +44,10 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-def recorded(env: str, kwargs: dict[str, Any], to: str, number: int = 3) -> dict[str, Any]:
-    """Episodes of random actions, written; what was seen and done."""
+def recorded(
+    env: str, kwargs: dict[str, Any], to: str, number: int = 3, valid: bool = False
+) -> dict[str, Any]:
+    """Episodes of random actions (`valid`: of those alone), written; what was seen and done."""
     made = make_env(env, kwargs)
     spaces = describe(made.observation_space, made.action_space)
     made.action_space.seed(0)
@@ -52,7 +58,8 @@ def recorded(env: str, kwargs: dict[str, Any], to: str, number: int = 3) -> dict
             listener.reset(seed=seed)
             done = False
             while not done:
-                *_, terminated, truncated, _ = listener.step(made.action_space.sample())
+                mask = made.unwrapped.valid if valid else None
+                *_, terminated, truncated, _ = listener.step(made.action_space.sample(mask))
                 done = terminated or truncated
             kept.append(listener.recorded(seed))
             add(kept[-1])
@@ -78,6 +85,65 @@ def test_both_kinds_of_file_give_the_same_learners_data(env: str, tmp_path: Path
     for name, array, same in zip(one._fields, one, other, strict=True):
         np.testing.assert_array_equal(array, same, err_msg=name)
     assert one.digest == other.digest
+
+
+def choosy(to: str, run: Path) -> dict[str, Any]:
+    """Episodes of a masked policy, which a run of one iteration holds."""
+    if not run.exists():
+        settings = {**SMALL, "arm": "ppo", "processes": 1, "steps": 64, "seeds": 1, **MASKED}
+        sauna.train("small_envs:Choosy", quiet=True, out=run, **settings)
+    return sauna.record(run, to, episodes=12, say=lambda text: None)
+
+
+def test_a_masked_policy_is_cloned_from_both_kinds_of_file(tmp_path, monkeypatch) -> None:
+    """Choosy raises at an action that is not valid, also at the first that a clone takes."""
+    import minari
+
+    made = []
+    for number, to in enumerate((str(tmp_path / "a.parquet"), f"minari:{tmp_path}/a-v0")):
+        found, out = choosy(to, tmp_path / "run"), tmp_path / f"clone-{number}"
+        settings = {**SMALL, "arm": "ppo", "processes": 1, "steps": 64, "seeds": 1, **MASKED}
+        sauna.train("small_envs:Choosy", quiet=True, out=out, init_from=f"data:{to}", **settings)
+        origin = read_config(out)["initial"]
+        assert origin["env_steps"] == found["env_steps"] == 12 * 6
+        held = origin["members"]["ppo/0"]
+        assert held["held_out"]["log_likelihood"] > held["before"]["log_likelihood"]
+        made.append(origin)
+    assert made[0]["sha256"] == made[1]["sha256"]
+    assert made[0]["members"] == made[1]["members"]
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    dataset = minari.load_dataset("a-v0")
+    assert dataset[0].infos["action_mask"].shape == (7, 5)
+    assert dataset.observation_space == small_envs.Choosy.observation_space
+
+
+def test_masks_that_are_missing_or_none_are_refused(tmp_path: Path) -> None:
+    import pyarrow.parquet
+
+    path = tmp_path / "a.parquet"
+    choosy(str(path), tmp_path / "run")
+    table = pyarrow.parquet.read_table(path)
+    overrides = {"env": "small_envs:Choosy", "arm": "ppo", "init_from": f"data:{path}"}
+    prepared = prepare({**overrides, **MASKED})
+    assert _read(prepared).observation.shape == (72, 3 + 5)
+    # Whoever does not act by masks does not need them.
+    plain = describe(small_envs.Choosy.observation_space, small_envs.spaces.Discrete(5, start=1))
+    assert {e.observation.shape for e in read_parquet(path, "data:a", plain, "")} == {(6, 3)}
+    empty = pyarrow.array([[0] * 5] * 72, pyarrow.list_(pyarrow.int8()))
+    short = pyarrow.array([[1] * 4] * 72, pyarrow.list_(pyarrow.int8()))
+    index = table.column_names.index("action_mask")
+    for changed, message in (
+        (table.drop_columns(["action_mask"]), "has no action_mask, which this policy acts by"),
+        (table.set_column(index, "action_mask", empty), "the action mask leaves no valid action"),
+        (table.set_column(index, "action_mask", short), "has 4 entries instead of 5"),
+    ):
+        pyarrow.parquet.write_table(changed, path)
+        with pytest.raises(BadInput, match=message):
+            _read(prepared)
+    to = f"minari:{tmp_path}/b-v0"
+    recorded("small_envs:Choosy", MASKED["env_kwargs"], to, valid=True)
+    with pytest.raises(BadInput, match="has no action_mask"):
+        _read(prepare({**overrides, **MASKED, "init_from": f"data:{to}"}))
 
 
 def test_minari_users_find_the_dataset_and_pandas_users_the_table(tmp_path, monkeypatch) -> None:

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.spaces import Spaces, action_reader, difference
+from sauna.envs.spaces import Spaces, action_reader, difference, seen_spaces
 from sauna.system.errors import BadInput
+from sauna.training.data.masks import check_taken
 
 MINARI = "minari:"  # before the name of a Minari dataset; anything else is a Parquet file
 
@@ -24,13 +25,14 @@ class Recorded(NamedTuple):
     reward: np.ndarray  # [L] float64
     terminated: bool
     truncated: bool  # also if it was cut
+    mask: np.ndarray | None = None  # [L + 1, K] int8 of the valid actions, beside the observations
 
 
 Add = Callable[[Recorded], None]
 
 
 class Stored(NamedTuple):
-    """One episode of a file, its observations read as a learner reads them."""
+    """One episode of a file, its observations read as a learner reads them, masks among them."""
 
     observation: np.ndarray  # [L, *obs] at each env step
     final: np.ndarray  # [*obs] behind the last step; without it, the last one before
@@ -69,7 +71,8 @@ def demonstrations(
       name: of the data, for messages.
 
     Raises:
-      BadInput: there are fewer than two episodes, or one is not of these spaces or not finite.
+      BadInput: there are fewer than two episodes, or one is not of these spaces, not finite, or
+        took an action that its mask calls invalid.
     """
     read = action_reader(action_space, rescale)
     found = [episode for episode in episodes if len(episode.reward)]
@@ -97,16 +100,17 @@ def demonstrations(
     for kind in ("observation", "action", "reward", "final"):
         if not np.isfinite(getattr(data, kind)).all():
             raise BadInput(f"{name}: not every {kind} is finite")
+    check_taken(data.observation, data.action, spaces, name)
     return data
 
 
 def check_same(theirs: Spaces, ours: Spaces, name: str, env: str) -> None:
-    """Refuses data of other spaces.
+    """Refuses data of other spaces. Masks are no part of them.
 
     Raises:
       BadInput: naming the part that differs.
     """
-    if differs := difference(theirs, ours):
+    if differs := difference(seen_spaces(theirs), seen_spaces(ours)):
         raise BadInput(f"{name} has other spaces than {env}: {differs}")
 
 

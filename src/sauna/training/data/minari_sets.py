@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sauna.envs.shapes import one_of
+from sauna.envs.shapes import mask_in, one_of
 from sauna.envs.spaces import Spaces, describe, observation_reader
 from sauna.envs.wrapping import PLAIN, Wrapping
 from sauna.system.errors import BadInput, one_line
@@ -26,6 +26,7 @@ from sauna.training.data.episodes import (
     check_installed,
     check_same,
 )
+from sauna.training.data.masks import COLUMN, read_masks, with_every_action, with_masks
 
 ROOT = "MINARI_DATASETS_PATH"
 
@@ -51,7 +52,8 @@ def minari_writer(
       text: `minari:NAME`, such as `minari:cartpole/ppo-v0`, or `minari:./FOLDER/NAME`.
       env: whose spaces are read.
       about: JSON values that say how the episodes were played.
-      wrapping: what is around it. With one, no description is stored: it would tell other spaces.
+      wrapping: what is around it. With one that gives other observations, no description is
+        stored: it would tell other spaces. Masks are infos.
 
     Raises:
       BadInput: the name is none, the dataset is there, or Minari is not.
@@ -71,7 +73,7 @@ def minari_writer(
     root.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=".sauna-", dir=root))
     try:
-        spec = _spec_of(env) if wrapping == PLAIN else None
+        spec = _spec_of(env) if wrapping._replace(action_mask=False) == PLAIN else None
         yield _Writer(temporary, name, env, spec, about).add
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (temporary / name).rename(root / name)
@@ -126,6 +128,7 @@ class _Writer:
             rewards=episode.reward,
             terminations=flags[0],
             truncations=flags[1],
+            infos=None if episode.mask is None else {COLUMN: episode.mask},
         )
         with _root(self._root):
             if self._dataset is None:
@@ -133,7 +136,7 @@ class _Writer:
                     self._name,
                     [buffer],
                     env=self._spec,
-                    observation_space=self._env.observation_space,
+                    observation_space=mask_in(self._env.observation_space)[1],
                     action_space=self._env.action_space,
                     algorithm_name=f"SAUNA {self._about['version']}, {self._about['member']}",
                     description=json.dumps(self._about),
@@ -178,16 +181,18 @@ def read_minari(text: str, name: str, spaces: Spaces, env: str) -> Iterator[Stor
         check_same(found, spaces, name, env)
         reader = observation_reader(dataset.observation_space)
         for episode in dataset.iterate_episodes():
-            yield _stored(episode, dataset.observation_space, reader)
+            yield _stored(episode, dataset.observation_space, reader, spaces, name)
     except BadInput as error:
         raise BadInput(str(error) if name in str(error) else f"{name}: {error}") from error
     except (ImportError, OSError, ValueError, LookupError, TypeError, AssertionError) as error:
         raise BadInput(f"{name} cannot be read as a Minari dataset: {one_line(error)}") from error
 
 
-def _stored(episode: Any, space: Any, reader: Any) -> Stored:
+def _stored(episode: Any, space: Any, reader: Any, spaces: Spaces, name: str) -> Stored:
     length = len(episode.rewards)
     rows = [reader(one_of(space, episode.observations, i)) for i in range(length + 1)]
     seen = np.stack(rows)
     ended = bool(len(episode.terminations) and episode.terminations[-1])
-    return Stored(seen[:-1], seen[-1], np.asarray(episode.actions), episode.rewards, ended)
+    masks = read_masks((episode.infos or {}).get(COLUMN), length, spaces, name)
+    own, final = with_masks(seen[:-1], masks, spaces), with_every_action(seen[-1], spaces)
+    return Stored(own, final, np.asarray(episode.actions), episode.rewards, ended)

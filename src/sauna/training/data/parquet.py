@@ -8,6 +8,7 @@
 | `reward` | float64 |
 | `terminated`, `truncated` | bool |
 | `final_observation` | list, in the last row of an episode: where it ended |
+| `action_mask` | list of int8, 1 for a valid choice, if the policy acts by masks |
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from sauna.envs.shapes import one_of
+from sauna.envs.shapes import mask_in, one_of
 from sauna.envs.spaces import Spaces, observation_reader, read_spaces
 from sauna.system.errors import BadInput, one_line
 from sauna.system.safe_read import Untrusted, open_file, parse_object
 from sauna.system.safe_write import replacing
 from sauna.training.data.episodes import Add, Recorded, Stored, check_installed, check_same
+from sauna.training.data.masks import COLUMN, read_masks, with_every_action, with_masks
 
 NEEDED = ("episode", "observation", "action", "reward", "terminated")
 KEY = b"sauna"  # of the file's metadata: how it was recorded, and the spaces
@@ -48,13 +50,14 @@ def parquet_writer(path: Path, env: Any, about: Mapping[str, Any]) -> Iterator[A
         raise BadInput(f"to: {path} is there already, or its folder is not")
     from pyarrow import parquet
 
-    reader = observation_reader(env.observation_space)
+    space = mask_in(env.observation_space)[1]
+    reader = observation_reader(space)
     with replacing(path) as part:
         file, number = None, 0
 
         def add(episode: Recorded) -> None:
             nonlocal file, number
-            table = _table(episode, number, env.observation_space, reader)
+            table = _table(episode, number, space, reader)
             if file is None:
                 described = {KEY: json.dumps(about).encode()}
                 file = parquet.ParquetWriter(part, table.schema.with_metadata(described))
@@ -76,6 +79,7 @@ def _table(episode: Recorded, number: int, space: Any, reader: Any) -> Any:
     seen = np.stack(rows)
     lists = pyarrow.list_(pyarrow.from_numpy_dtype(seen.dtype))
     last, ends = np.arange(length) == length - 1, [None] * (length - 1)
+    masks = {} if episode.mask is None else {COLUMN: _lists(episode.mask[:-1])}
     return pyarrow.table(
         {
             "episode": np.full(length, number),
@@ -87,6 +91,7 @@ def _table(episode: Recorded, number: int, space: Any, reader: Any) -> Any:
             "terminated": last & episode.terminated,
             "truncated": last & episode.truncated,
             "final_observation": pyarrow.array([*ends, seen[-1].tolist()], lists),
+            **masks,
         }
     )
 
@@ -102,8 +107,8 @@ def _lists(rows: np.ndarray) -> Any:
 def read_parquet(path: Path, name: str, spaces: Spaces, env: str) -> Iterator[Stored]:
     """The episodes of a file, of `sauna record` or any with the same columns.
 
-    `step`, `seed`, `truncated` and `final_observation` may be missing. Rows of an episode follow
-    one another.
+    `step`, `seed`, `truncated` and `final_observation` may be missing, and `action_mask` where no
+    mask is acted by. Rows of an episode follow one another.
 
     Raises:
       BadInput: there is no such file, it is not Parquet, a column is missing or has holes, or it
@@ -126,12 +131,15 @@ def read_parquet(path: Path, name: str, spaces: Spaces, env: str) -> Iterator[St
     seen = columns["observation"].reshape((-1, *_shape_of(columns, spaces)))
     last = np.append(columns["episode"][1:] != columns["episode"][:-1], True)
     finals = _finals(table, name)
+    given = _rows(table, COLUMN, name) if spaces.mask and COLUMN in table.column_names else None
+    masks = read_masks(given, len(seen), spaces, name)
     for first, end in pairwise([0, *(np.flatnonzero(last) + 1).tolist()]):
         own = seen[first:end]
-        final = own[-1] if finals is None else finals[end - 1]
+        final = None if finals is None else finals[end - 1]
+        final = own[-1] if final is None else np.asarray(final, seen.dtype)
         yield Stored(
-            own,
-            own[-1] if final is None else np.asarray(final, seen.dtype).reshape(own.shape[1:]),
+            with_masks(own, None if masks is None else masks[first:end], spaces),
+            with_every_action(final.reshape(own.shape[1:]), spaces),
             columns["action"][first:end],
             columns["reward"][first:end],
             bool(columns["terminated"][end - 1]),
@@ -139,7 +147,7 @@ def read_parquet(path: Path, name: str, spaces: Spaces, env: str) -> Iterator[St
 
 
 def _shape_of(columns: Mapping[str, np.ndarray], spaces: Spaces) -> tuple[int, ...]:
-    """The shape of an observation: the environment's, if a row has as many numbers."""
+    """The shape of an observation but for its mask: the environment's, if a row fits it."""
     width, shape = columns["observation"].shape[1:], tuple(spaces.observation_shape)
     return shape if width == (int(np.prod(shape)),) else width
 
