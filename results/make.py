@@ -3,7 +3,7 @@
     python results/make.py             docs and figures from the result files
     python results/make.py --collect   takes what the studies in runs/ have found so far, first
     python results/make.py --train     trains first (many hours), continuing where it stopped;
-                                       a task that a result file holds whole is not trained again
+                                       what a result file holds whole is not trained again
 
 The runs stay in `runs/`, which is not in the repository; what is committed is each member's final
 numbers and a thinned curve.
@@ -70,29 +70,34 @@ def train(name: str) -> None:
 
 
 def remaining(name: str) -> Path | str | None:
-    """The study without those tasks that `results/NAME.json` holds whole; None if it holds all.
+    """The study without what `results/NAME.json` holds whole; None if it holds all.
 
-    So a study of many tasks can be trained on several machines, or without the runs of before.
+    So a large study can be trained on several machines, or without the runs of before: arm by arm
+    and task by task. A baseline is trained with each arm that it is the baseline of.
     """
     spec, stored = load_spec(name), load(name)
     if name in MEASURED or not stored or (ROOT / "runs" / name).exists():
         return name
     trained = {(cell["task"], cell["label"]): len(cell["members"]) for cell in stored["cells"]}
-    tasks = [
-        task
-        for task in spec.tasks
-        if any(
-            trained.get((task, arm.label), 0) < len(arm.seeds)
-            for arm in spec.arms
-            if task in arm.tasks
-        )
+    missing = {
+        arm.label: [t for t in arm.tasks if trained.get((t, arm.label), 0) < len(arm.seeds)]
+        for arm in spec.arms
+    }
+    if not any(missing.values()):
+        return None
+    for arm in spec.arms:
+        if arm.baseline is not None:
+            missing[arm.baseline] += missing[arm.label]
+    text = re.sub(r"^tasks = .*\n", "", built_in()[name], flags=re.M)
+    head, *arms = text.split("[[arms]]\n")
+    left = [
+        f"[[arms]]\ntasks = {json.dumps([t for t in spec.tasks if t in missing[label]])}\n{arm}"
+        for label, arm in zip(missing, arms, strict=True)
+        if missing[label]
     ]
-    if len(tasks) in (0, len(spec.tasks)):
-        return name if tasks else None
     path = ROOT / "runs" / f"{name}.toml"
     path.parent.mkdir(exist_ok=True)
-    own = f"tasks = {json.dumps(tasks)}"
-    path.write_text(re.sub(r"^tasks = .*$", own, built_in()[name], flags=re.M))
+    path.write_text(head + "".join(left))
     return path
 
 

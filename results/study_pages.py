@@ -26,6 +26,7 @@ from studies import (
 from sauna.experiments.report.numbers import digits_of, digits_of_tasks, interval, number
 from sauna.experiments.study.spec import load_spec
 from sauna.experiments.study.tables import PAPER, unversioned
+from sauna.experiments.study.verdicts import seeds_needed
 
 CAPTION = (
     "*Training return, mean of the last 100 episodes. Line: mean of the seeds. Band: 95% interval "
@@ -148,6 +149,9 @@ def _of_task(task: str, name: str, results: Mapping[str, Any], summary: Mapping[
             "random control):",
             listed(controls),
         ]
+    both = [v for v in [*summary["verdicts"], *summary["filtering"]] if v["task"] == task]
+    if seeds := seeds_needed(both):
+        parts.append(seeds)
     return folded(f"{task}: all arms and comparisons", "\n\n".join(parts))
 
 

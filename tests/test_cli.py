@@ -119,6 +119,7 @@ BAD = [
     (["inspect", "nothere", "--episodes", "0"], "episodes: must be a whole number of at least 1"),
     (["inspect", "nothere", "--frames"], "did you mean '--no-frames'?"),
     (["list", "foo"], "invalid choice"),
+    (["train", ENV, "--arm", "my:rule"], "--arm ppo --sampler my:rule, or --arm sauna --filter"),
     (["trian", ENV], "invalid choice: 'trian'"),
 ]
 

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 from sauna import __version__
 from sauna.config.accepted import translate
+from sauna.config.choices import LISTS
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint, spread_hint
 from sauna.config.parsing import whole_number
@@ -25,7 +26,7 @@ from sauna.config.presets import (
     overrides_of,
     parse_all,
 )
-from sauna.config.settings import FIELDS, NATIVE, fields_with, flag
+from sauna.config.settings import FIELDS, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.check import flags as checking
 from sauna.experiments.evaluate import MAX_STEPS
@@ -35,8 +36,6 @@ from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
 
-_CHOICES = ("arms", "rules", "presets", "filters", "targets", "studies")
-LISTS = ("zoo", "envs", "atari", *NATIVE, *_CHOICES)
 # Where a comparison or a study trains.
 _PLACE: dict[str, dict[str, Any]] = {
     "out": {
@@ -117,7 +116,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
         text = "each member as it was at its best evaluation during training"
         command.add_argument("--best", action="store_true", help=text)
 
-    text = "one page: an episode, what the Vex head says of it, what the filter drops"
+    text = "one page: an episode, what the Vex head says of it, what today's rule takes of it"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
     inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
     inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")
@@ -198,7 +197,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     checking.add_command(commands)
 
     lists = commands.add_parser("list", help="what there is to choose from", allow_abbrev=False)
-    lists.add_argument("what", choices=LISTS, metavar="|".join(LISTS))
+    text = f"{', '.join(LISTS)} (without: what these are)"
+    lists.add_argument("what", nargs="?", choices=LISTS, metavar="WHAT", help=text)
     return parser
 
 

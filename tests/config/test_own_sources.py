@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from sauna.config import own_sources
+from sauna.config import own_sources, rule_sources
 from sauna.config.code import changed_code, code_of
 from sauna.config.own_sources import KEY, edited_sources, newer_sources, sources_of
+from sauna.config.presets import resolve_run
+from sauna.config.stored import to_stored
 from sauna.experiments.study.command import comparison
 from sauna.experiments.study.found_runs import check_same_code
 from sauna.experiments.study.units import units_of
@@ -119,7 +122,9 @@ def test_a_comparison_reuses_no_run_of_an_edited_rule(
         (run / "config.json").write_text(json.dumps(stored))
     said: list[str] = []
     if not accept:
-        with pytest.raises(BadInput, match=r"top-advantage.*sources, aaa\+changes -> .*edited"):
+        with pytest.raises(
+            BadInput, match=r"top-advantage.*sources differ, aaa\+changes -> .*rm -r"
+        ):
             check_same_code(units, tmp_path, False, said.append)
         return
     check_same_code(units, tmp_path, True, said.append)
@@ -127,3 +132,78 @@ def test_a_comparison_reuses_no_run_of_an_edited_rule(
     monkeypatch.setattr("sauna.config.code.own_sources", lambda: "zzz 9")
     check_same_code(units, tmp_path, False, said.append)
     assert len(said) == 1 and "reused: 2 runs" in said[0]
+
+
+def test_a_committed_edit_of_a_rule_is_refused_by_the_runs_of_that_rule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rules = tmp_path / "selection"
+    shutil.copytree(rule_sources.FOLDER, rules)
+    monkeypatch.setattr(rule_sources, "FOLDER", rules)
+    monkeypatch.setattr("sauna.config.code.own_sources", lambda: "aaa 1")
+    arms = ("ppo", "top-advantage", "top-advantage+random", "prioritized", "sauna+avec")
+    units = {
+        unit.label: unit for unit in units_of(comparison("Hopper-v5", arms, {"seeds": (0,)}), 3)
+    }
+    before = {arm: code_of(unit.settings) for arm, unit in units.items()}
+    assert not [name for name in before["ppo"] if name.startswith(rule_sources.PREFIX)]
+    for unit in units.values():
+        run = unit.run(tmp_path)
+        run.mkdir(parents=True)
+        stored = {"config": {}, "spaces": [], "code": code_of(unit.settings)}
+        (run / "config.json").write_text(json.dumps(stored))
+
+    monkeypatch.setattr("sauna.config.code.own_sources", lambda: "bbb 2")  # committed
+    said: list[str] = []
+    check_same_code([*units.values()], tmp_path, False, said.append)
+    assert len(said) == 1 and "reused: 5 runs of sauna aaa" in said[0]
+    file = rules / "top_advantage.py"
+    file.write_text("# a comment\n" + file.read_text().replace("Keeps the", "Holds the"))
+    check_same_code([*units.values()], tmp_path, False, said.append)
+    file.write_text(file.read_text() + "\nSHARE = 0.1\n")
+    with pytest.raises(BadInput, match="source of the rule top-advantage differs"):
+        check_same_code([*units.values()], tmp_path, False, said.append)
+    changed = [
+        arm for arm, unit in units.items() if changed_code(before[arm], code_of(unit.settings))
+    ]
+    assert changed == ["top-advantage", "top-advantage+random"]
+    shared = rules / "scores.py"  # which prioritized imports, too
+    shared.write_text(shared.read_text() + "\nSHARE = 0.1\n")
+    changed = [
+        arm for arm, unit in units.items() if changed_code(before[arm], code_of(unit.settings))
+    ]
+    assert changed == ["top-advantage", "top-advantage+random", "prioritized"]
+
+
+def test_runs_that_noted_no_rule_are_named_with_what_trains_them_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sauna.config.code.own_sources", lambda: "bbb 2")
+    units = units_of(comparison("Hopper-v5", ("ppo", "top-advantage"), {"seeds": (0,)}), 3)
+    for unit in units:
+        unit.run(tmp_path).mkdir(parents=True)
+        stored = {"config": {}, "spaces": [], "code": {KEY: "aaa 1"}}
+        (unit.run(tmp_path) / "config.json").write_text(json.dumps(stored))
+    said: list[str] = []
+    check_same_code(units, tmp_path, False, said.append)
+    assert said[1].startswith("warning: 1 reused run did not note")
+    assert said[1].endswith(f"rm -r {units[1].run(tmp_path)}")
+
+
+def test_every_built_in_rule_is_found_in_its_file() -> None:
+    from sauna.algorithm.selection import registry
+
+    named = (registry.SAMPLERS, registry.LOSS_WEIGHTS, registry.STOPS)
+    functions = (registry.OBJECTIVES, registry.CRITICS, registry.AUXILIARY)
+    for name, rule in (pair for rules in (*named, *functions) for pair in rules.items()):
+        if rule is not None:
+            assert rule.__module__.rpartition(".")[2] == rule_sources.file_of(name)
+    for name in ("sauna", "random-drop"):
+        assert (rule_sources.FOLDER / f"{rule_sources.file_of(name)}.py").is_file()
+
+
+def test_a_stored_run_names_the_rules_of_each_of_its_arms() -> None:
+    run = resolve_run({"env": "Hopper-v5", "arm": "ppo,sauna"})
+    keys = {"sauna rule sauna"}
+    assert set(rule_sources.rule_sources(to_stored(run))) == keys
+    assert set(rule_sources.rule_sources({"arm": ["ppo", "sauna"]})) == keys

@@ -436,6 +436,20 @@ def test_the_page_needs_nothing_else(page) -> None:
     assert "url(" not in text[text.index("<style>") : text.index("</style>")]
 
 
+def test_other_code_than_that_of_the_run_is_said(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said() -> list[str]:
+        lines: list[str] = []
+        page = tmp_path / "page.html"
+        sauna.inspect(run, member="sauna/0", out=page, frames=False, say=lines.append)
+        return [line for line in lines if "other code" in line]
+
+    assert said() == []
+    monkeypatch.setattr("sauna.config.code.own_sources", lambda: "bbb 2")
+    assert "warning: the rule is asked with today's code" in said()[0] and "bbb" in said()[0]
+
+
 def test_without_a_head_the_page_says_so(run, browser, tmp_path) -> None:
     path = sauna.inspect(run, member="ppo/0", out=tmp_path / "ppo.html", frames=False)
     assert "There is no Vex prediction: ppo trains no Vex head" in path.read_text()

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+
+import pytest
+
+from sauna import cli
+from sauna.config.arms import SHARES
+from sauna.config.choices import LISTS
 from sauna.config.presets import PRESETS
+from sauna.config.settings import NATIVE
 from sauna.config.zoo import ENVS
 from sauna.experiments.listing import listing
 
@@ -26,3 +34,21 @@ def test_presets_are_followed_by_the_zoo() -> None:
     lines = listing("presets")
     assert [line.split()[0] for line in lines[: len(PRESETS)]] == list(PRESETS)
     assert [line.split()[0] for line in lines[-len(ENVS) :]] == list(ENVS)
+
+
+def test_without_a_name_each_list_is_named_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["list"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:3] for line in lines] == [["sauna", "list", name] for name in LISTS]
+    assert set(NATIVE) < set(LISTS)
+
+
+def test_rules_stand_beside_the_share_that_their_sampler_has() -> None:
+    from sauna.algorithm.selection.registry import SAMPLERS
+
+    shares = {
+        name: inspect.signature(make).parameters.get("share") for name, make in SAMPLERS.items()
+    }
+    assert {name: share.default for name, share in shares.items() if share} == SHARES
+    (kondo,) = (line for line in listing("rules") if line.startswith("kondo"))
+    assert kondo.split()[:3] == ["kondo", "rollout", "0.3"]

@@ -150,7 +150,7 @@ def test_python_calls_per_vector_step() -> None:
 
 
 # Seven of them are compiled loops, each for all members: none of the calls is made once per member.
-# Of the `lambda`s one samples continuous actions, one makes the `Step`; `reshape` gives views.
+# The `lambda` samples continuous actions; `reshape` gives views.
 PER_STEP = {
     "_act": 1,
     "_clip": 1,
@@ -161,14 +161,13 @@ PER_STEP = {
     "_see_and_normalize": 1,
     "act": 1,
     "empty": 1,
-    "<lambda>": 2,
+    "<lambda>": 1,
     "step": 2,
     "evaluate": 1,
     "_is_finite": 1,
     "_make_room": 1,
     "tolist": 1,
     "_told": 1,
-    "__new__": 1,
     "see_and_normalize": 1,
     "reshape": 3,
 }

@@ -82,6 +82,15 @@ RULE_HELP = {
     "sauna": "collect: keep a step if its predicted explained variance is informative (eq. 7)",
     **{name: text for name, text in ARM_HELP.items() if text.split(": ")[0] in STAGES},
 }
+# The default `share` of samplers that have one.
+SHARES = {
+    "top-advantage": 0.5,
+    "prioritized": 1.0,
+    "gradient-norm": 1.0,
+    "kondo": 0.3,
+    "pods": 0.5,
+    "vex-oracle": 0.5,
+}
 CONTROL_HELP = {
     "random": "control: as many samples as the rule takes in each iteration, at random",
     "stride": "control: as many, every k-th",
@@ -118,6 +127,11 @@ def arm_settings(arm: str) -> dict[str, Any]:
 def _part(name: str) -> Mapping[str, Any]:
     if name in CONTROLS:
         raise BadInput(f"arm: {name} follows a rule; join it to one, such as gigaflow+{name}")
+    if ":" in name:
+        raise BadInput(
+            f"arm: {name} is a rule of your own: give --arm ppo --sampler {name}, or --arm sauna "
+            f"--filter {name}; `sauna compare ENV --arms ppo,{name}` takes it as it is"
+        )
     if name not in ARMS:
         raise BadInput(f"unknown arm {name!r} (known: {', '.join(ARMS)}){nearest(name, ARMS)}")
     return ARMS[name]

@@ -13,6 +13,8 @@ from sauna.system.errors import BadInput
 
 MIN_MINIBATCH = 2  # samples; of fewer, nothing can be standardised
 SMALL_MINIBATCH = 16  # samples; below, a run says so
+FEW_UPDATES = 10  # below which a training is said to be short
+LEFT_OVER = 0.05  # share of the budget that fills no rollout, from which it is named
 
 
 def is_read(name: str, config: Config) -> bool:
@@ -293,9 +295,37 @@ def own_parts(config: Config) -> list[str]:
     return [name for name in names if ":" in getattr(config, name)]
 
 
+def budget_note(config: Config) -> str:
+    """Says how much of a small budget is trained, in whole rollouts; empty if nothing is worth it.
+
+    A filter's rollouts have no fixed number of env steps: nothing is said of them.
+    """
+    rollout = config.rollout_steps * config.envs
+    updates = config.steps // rollout
+    trained, left = updates * rollout, config.steps % rollout
+    if config.filter != "none" or not (updates < FEW_UPDATES or left > LEFT_OVER * config.steps):
+        return ""
+    share = f"{trained:,} of {config.steps:,}" if left else f"all {trained:,}"
+    times = f"{updates} update{'s' * (updates != 1)}"
+    return (
+        f"note: {share} env steps are trained, in {times}: a rollout has {rollout:,} steps, which "
+        "--rollout-steps changes"
+    )
+
+
 def cautions(config: Config) -> list[str]:
     """Says what can be trained with, but seldom is meant."""
+    found: list[str] = []
     size = config.rollout_steps * config.envs // config.minibatches
-    if size < SMALL_MINIBATCH and config.normalize_advantages and config.algorithm == "ppo":
-        return [f"warning: minibatches of {size} samples: their advantages are standardised alone"]
-    return []
+    if not config.normalize_advantages or config.algorithm != "ppo":
+        return found
+    if size < SMALL_MINIBATCH:
+        found.append(
+            f"warning: minibatches of {size} samples: their advantages are standardised alone"
+        )
+    if ":" in config.sampler and config.normalize_over == "minibatch":
+        found.append(
+            "note: advantages are standardised over each minibatch, the default; for a sampler "
+            "that ranks by the advantage give --normalize-over rollout"
+        )
+    return found

@@ -31,3 +31,19 @@ ACTIVATIONS = (
 NETWORKS = ("auto", "mlp", "nature-cnn", "small-cnn", "impala-cnn")
 OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
 SCHEDULES = ("constant", "linear", "cosine")
+# What `sauna list` can name.
+LISTS = {
+    "envs": "environments, with the preset, the env steps and RL Zoo's return of those it knows",
+    "presets": "named settings of training, and what `sauna train ENV` takes",
+    "arms": "what --arm takes: which rules a run trains with",
+    "rules": "rules of sample selection: when each acts and how much it keeps",
+    "filters": "what --filter takes",
+    "targets": "what --vex-target takes",
+    "studies": "comparisons that `sauna study` runs",
+    "zoo": "trained policies that come with this package",
+    "atari": "Atari games (extra [atari])",
+    "gymnax": "environments of gymnax, on the device (extra [gymnax])",
+    "playground": "environments of MuJoCo Playground, on the device (extra [playground])",
+    "brax": "environments of Brax, on the device (extra [brax])",
+    "mjx": "environments of MJX, on the device (extra [mjx])",
+}

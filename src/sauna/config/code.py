@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.own_sources import KEY, edited_sources, own_sources
+from sauna.config.rule_sources import PREFIX, changed_rules, rule_sources
 from sauna.config.trust import named_code
 from sauna.system.tracebacks import is_users
 
@@ -35,9 +36,9 @@ def code_of(settings: Mapping[str, Any]) -> dict[str, str]:
     """`{module: SHA-256, package: version}` of the code that settings, or a stored config, name.
 
     Its modules have been imported already; nothing is imported here. `sauna` holds the sources of
-    this package.
+    this package, `sauna rule NAME` the source of a built-in rule that the run learns with.
     """
-    found = {KEY: own_sources()}
+    found = {KEY: own_sources(), **rule_sources(settings)}
     env = str(settings.get("config", settings).get("env"))
     for module in _named_modules(settings, env):
         _add_module(module, found)
@@ -50,11 +51,13 @@ def code_of(settings: Mapping[str, Any]) -> dict[str, str]:
 def changed_code(before: Mapping[str, Any], now: Mapping[str, str]) -> str:
     """What of the code is not what it was, as a text; empty where nothing differs.
 
-    A newer version of this package is no change: `own_sources.newer_sources` names it.
+    A newer version of this package is no change, unless a rule of the run differs:
+    `own_sources.newer_sources` names it.
     """
     names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
-    names = [name for name in names if name != KEY]
+    names = [name for name in names if name != KEY and not name.startswith(PREFIX)]
     parts = [text for text in [edited_sources(before, now)] if text]
+    parts += [f"the source of the rule {name} differs" for name in changed_rules(before, now)]
     for name in sorted(names):
         old, new = before.get(name), now.get(name)
         if " " in name:  # a package

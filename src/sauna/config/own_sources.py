@@ -2,7 +2,8 @@
 
 A run stores both under `code["sauna"]`, as `REVISION DIGEST`. The revision is the version of the
 package, or the git revision of a checkout, which ends in `+changes` while its sources are edited.
-So a new version differs from an edit: the first is named, the second is refused.
+So a new version differs from an edit: the first is named, the second is refused. A rule that
+differs is refused in both cases: see `rule_sources.py`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def edited_sources(before: Mapping[str, str], now: Mapping[str, str]) -> str:
         return ""
     if old[0] != new[0] and not (old[0] + new[0]).count(git.EDITED):
         return ""
-    return f"sauna's own sources, {old[0]} -> {new[0]}, were edited"
+    return f"sauna's own sources differ, {old[0]} -> {new[0]}"
 
 
 def newer_sources(before: Mapping[str, str], now: Mapping[str, str]) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from sauna.config.arms import SHARES
+from sauna.config.choices import LISTS
 from sauna.config.presets import (
     ARM_HELP,
     CONTROL_HELP,
@@ -21,12 +23,14 @@ HELP = {"arms": ARM_HELP, "presets": PRESET_HELP, "filters": FILTER_HELP, "targe
 HEAD = ("environment", "preset", "env steps", "RL Zoo's return")
 
 
-def listing(what: str) -> list[str]:
-    """Returns the lines of one list.
+def listing(what: str | None) -> list[str]:
+    """Returns the lines of one list, or what lists there are.
 
     Raises:
       BadInput: it is the list of a backend that is not installed.
     """
+    if what is None:
+        return [f"sauna list {name:{len('playground')}}  {text}" for name, text in LISTS.items()]
     if what == "envs":
         return list(_envs())
     if what == "atari":
@@ -91,8 +95,13 @@ def _columns(row: tuple[str, ...]) -> str:
 
 
 def _rules() -> Iterator[str]:
+    row = "{:15} {:8} {:>5}  {}".format
+    yield row("rule", "stage", "share", "what it does")
     for name, text in {**RULE_HELP, **CONTROL_HELP}.items():
         stage, _, sentence = text.partition(": ")
-        yield f"{name:15} {stage:8} {sentence}"
+        yield row(name, stage, SHARES.get(name, "-"), sentence)
     yield ""
+    yield "Share: how much of a rollout the rule keeps or draws, changed by --sampler-kwargs."
+    yield "A rule without one keeps what it finds in each rollout, or all."
     yield "Join rules by +, such as sauna+avec, and a control to a rule: gigaflow+random"
+    yield "Arm positive changes all advantages; --sampler positive keeps the samples above 0."

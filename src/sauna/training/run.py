@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sauna.config.checks import cautions, check_consistent, local_parts
+from sauna.config.checks import budget_note, cautions, check_consistent, local_parts
 from sauna.config.code import changed_code, code_of
 from sauna.config.imported_from import KEY, folders_of, names_the_folder
 from sauna.config.own_sources import newer_sources
@@ -184,7 +184,8 @@ def _show_notes(prepared: Prepared, display: Display) -> None:
     config = prepared.config
     if note := many_seeds(config.seeds):
         display.say(note)
-    for caution in cautions(config):
+    short = [note for own in prepared.run.arms.values() if (note := budget_note(own))]
+    for caution in dict.fromkeys([*cautions(config), *short]):
         display.say(caution)
     if prepared.differs:
         display.say(

@@ -94,6 +94,24 @@ class Clocked(Good):
         return answer
 
 
+class Mixed(Good):
+    """It fails at a step of its own, or its time limit is reported as a termination."""
+
+    def reset(self, **given: Any) -> Any:
+        answer = super().reset(**given)
+        self.left = int(min(self.np_random.integers(5, 40), 20))
+        return answer
+
+
+class Varied(Good):
+    """Its episodes have any length below a bound."""
+
+    def reset(self, **given: Any) -> Any:
+        answer = super().reset(**given)
+        self.left = int(self.np_random.integers(5, 20))
+        return answer
+
+
 class Raising(Good):
     def step(self, action: Any) -> Any:
         raise ZeroDivisionError("of mine")
@@ -114,7 +132,8 @@ def test_nothing_is_wrong_with_a_good_one() -> None:
     result = check(name_of(Good), "{}", 60)
     assert result.findings == []
     assert (
-        "60 steps with random actions" in result.facts[2] and "time limit none" in result.facts[3]
+        "60 steps with random actions" in result.facts[2]
+        and "no time limit is registered" in result.facts[3]
     )
 
 
@@ -138,6 +157,12 @@ def test_what_is_wrong_is_named(env: type, kind: str, text: str) -> None:
     findings = found(env)
     assert [k for k, said in findings if text in said] == [kind], findings
     assert findings == sorted(findings, key=lambda finding: finding[0] != WRONG)
+
+
+@pytest.mark.parametrize("steps", [100, 300, 2000])
+def test_a_limit_behind_real_failures_is_told_from_lengths_that_vary(steps: int) -> None:
+    assert [text for _, text in found(Mixed, steps) if "after exactly 20 steps" in text]
+    assert not [text for _, text in found(Varied, steps) if "time limit" in text]
 
 
 class Choosy(Good):

@@ -27,7 +27,8 @@ BASE = cell("ppo", [0.0, 5.0, 10.0], [0.0, 5.0, 11.0], [0.0, 6.0, 12.0], baselin
 def test_an_arm_that_is_there_sooner() -> None:
     (text,) = said(BASE, cell("mine", [0.0, 22.0, 30.0], [0.0, 22.0, 30.0], [0.0, 22.0, 30.0]))
     # 11 of 22 is half of the way to 50: a quarter of ppo's 100.
-    assert text.startswith("mine: reaches ppo's final return on A-v0 with 0.25 of ppo's learner")
+    assert text.startswith("mine: reaches ppo's final return on A-v0 with this multiple of ppo's")
+    assert "compute: in samples 0.25 (interval from" in text
 
 
 def test_nothing_is_said_of_a_baseline_that_has_not_learnt() -> None:
@@ -40,14 +41,17 @@ def test_nothing_is_said_of_a_baseline_that_has_not_learnt() -> None:
 
 def test_an_open_interval_is_not_decided() -> None:
     (text,) = said(BASE, cell("mine", [0.0, 30.0, 30.0], [0.0, 2.0, 3.0], [0.0, 9.0, 9.0]))
-    assert text.startswith("mine: not decided how much it takes to reach ppo's final return")
-    assert text.endswith(", not reached].")
+    assert text.startswith("mine: not decided with how much compute it reaches ppo's final return")
+    assert text.endswith(" to never).")
     (text,) = said(BASE, cell("mine", [0.0, 12.0, 14.0], [0.0, 2.0, 3.0], [0.0, 9.0, 9.0]))
-    assert "not decided" in text and "not reached by the mean, of ppo's learner compute [" in text
+    assert (
+        "not decided" in text
+        and "in samples the mean curve never gets there (interval from" in text
+    )
 
 
 def test_an_arm_that_never_gets_there() -> None:
     (text,) = said(BASE, cell("mine", [0.0, 2.0, 3.0], [0.0, 2.0, 3.0]))
     assert text == "mine: does not reach ppo's final return on A-v0."
     (text,) = said(BASE, cell("mine", [0.0, 22.0, 30.0]))  # one seed
-    assert text.endswith("0.25 of ppo's learner compute, no interval.")
+    assert text.endswith("in samples 0.25, without an interval.")

@@ -1,4 +1,4 @@
-"""`results/make.py`: result files that several trainings of a study fill, task by task."""
+"""`results/make.py`: result files that several trainings of a study fill, arm by arm."""
 
 from __future__ import annotations
 
@@ -53,9 +53,7 @@ def test_cells_of_other_settings_do_not_stay() -> None:
     assert make.merged(file_of([other], "here"), new, spec)["cells"] == new["cells"]
 
 
-def test_only_the_tasks_that_a_file_lacks_are_trained(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_only_what_a_file_lacks_is_trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     spec = load_spec(NAME)
     first, second = spec.tasks
     stored: dict[str, Any] = {}
@@ -63,15 +61,16 @@ def test_only_the_tasks_that_a_file_lacks_are_trained(
     monkeypatch.setattr(make, "load", lambda name: stored)
     assert make.remaining(NAME) == NAME
 
-    stored.update(file_of([*whole(spec, first, 1.0), cell(spec, second, 0, 1.0, 1)], "here"))
+    baseline, *others = range(len(spec.arms))
+    some = [cell(spec, second, i, 1.0) for i in (baseline, *others[1:])]
+    stored.update(file_of([*whole(spec, first, 1.0), *some], "here"))
     path = make.remaining(NAME)
     assert isinstance(path, Path)
     part = load_spec(str(path))
-    assert (part.name, part.tasks, part.arms[0].settings) == (
-        NAME,
-        [second],
-        spec.arms[0].settings,
-    )
+    assert part.name == NAME
+    assert [(arm.label, arm.tasks, arm.settings) for arm in part.arms] == [
+        (spec.arms[i].label, (second,), spec.arms[i].settings) for i in (baseline, others[0])
+    ]
 
     stored.update(file_of([*whole(spec, first, 1.0), *whole(spec, second, 1.0)], "here"))
     assert make.remaining(NAME) is None

@@ -217,7 +217,7 @@ def test_compute_is_carried_from_the_runs_to_the_verdict(tmp_path: Path) -> None
     at = 150 * mean / (mean + 100)
     ratio = found["gigaflow"]["ratios"]["samples_backward"][0]
     assert ratio == pytest.approx(at / 300, rel=1e-4)
-    assert f"{ratio:.2f} of ppo's learner compute" in found["gigaflow"]["text"]
+    assert f"in samples {ratio:.2f}" in found["gigaflow"]["text"]
     assert set(summary["by_compute"]["A-v0"]) == {"samples_backward", "learner_cpu_seconds"}
 
 

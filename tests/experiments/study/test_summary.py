@@ -38,6 +38,7 @@ ROW = {
     "sampler",
     "sample_rate",
     "env_steps",
+    "fewest_episodes",
     "kept_steps",
     "samples_backward",
     "improvement",
@@ -108,7 +109,29 @@ def test_better_worse_and_no_evidence() -> None:
     alike = verdict(cell("ppo", LOW), cell("sauna", ALIKE, keep_rate=0.7))
     assert alike["kind"] == "no evidence"
     assert alike["text"].startswith("sauna: not decided against ppo on Cheetah (p")
-    assert "more than 1000 seeds of each would be needed" in alike["text"]
+    assert alike["needed"] == "more than 1000" and worse["needed"] is better["needed"] is None
+
+
+def test_seeds_that_would_decide_are_said_once() -> None:
+    summary = summarize(results(cell("ppo", LOW), cell("sauna", ALIKE), cell("espo", ALIKE)))
+    said = [line for line in lines(summary) if "would decide" in line]
+    assert len(said) == 1 and "sauna against ppo more than 1000, espo against ppo" in said[0]
+    decided = summarize(results(cell("ppo", LOW), cell("sauna", HIGH)))
+    assert not [line for line in lines(decided) if "would decide" in line]
+
+
+def test_a_final_return_of_few_episodes_is_named() -> None:
+    def said(*of_sauna: int) -> list[str]:
+        both = cell("ppo", LOW), cell("sauna", HIGH)
+        for member in both[0]["members"] + both[1]["members"]:
+            member["episodes"] = 100
+        for member, number in zip(both[1]["members"], of_sauna, strict=False):
+            member["episodes"] = number
+        return [line for line in lines(summarize(results(*both))) if "episodes" in line]
+
+    (note,) = said(300, 7, 40)
+    assert "fewer than 100 episodes (sauna 7): its final return is the mean of all" in note
+    assert said(100, 300) == []
 
 
 def test_what_a_sampler_leaves_out_is_shown() -> None:

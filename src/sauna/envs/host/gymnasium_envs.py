@@ -69,6 +69,15 @@ class GymnasiumEnvs(HostEnvs):
         self._truncated = np.zeros(number, bool)
         self._life_lost = np.zeros(number, bool)
         self._info: dict[int, dict[str, float]] = {}  # of this step
+        self._uneventful = Step(  # made once, as its arrays stay
+            self._observation,
+            self._reward,
+            self._terminated,
+            self._truncated,
+            self._life_lost,
+            self._final,
+            ended=False,
+        )
 
     def reset(self) -> np.ndarray:
         for index, slot in enumerate(self._slots):
@@ -113,16 +122,7 @@ class GymnasiumEnvs(HostEnvs):
         return self._told(ended)
 
     def _told(self, ended: bool) -> Step:
-        return Step(
-            self._observation,
-            self._reward,
-            self._terminated,
-            self._truncated,
-            self._life_lost,
-            self._final,
-            ended,
-            self._info,
-        )
+        return self._uneventful._replace(ended=True, info=self._info) if ended else self._uneventful
 
     def _take(self, slot: Slot, action: np.ndarray) -> Any:
         """One step of one environment, as Gymnasium gives it."""

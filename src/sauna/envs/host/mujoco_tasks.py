@@ -95,7 +95,6 @@ class BatchTask(Task):
         self.qpos[index], self.qvel[index] = data.qpos, data.qvel
 
     def step(self, active: np.ndarray, action: np.ndarray, out: Outcome) -> None:
-        self._begun[:] = self.state[:, :2]
         _advance(
             self._addresses,
             self._frame_skip,
@@ -103,6 +102,7 @@ class BatchTask(Task):
             active,
             action,
             self._control,
+            self._begun,
             self.state,
         )
         self.evaluate(action, out)
@@ -164,6 +164,7 @@ def _advance(
     active: Any,
     action: Any,
     control: Any,
+    begun: Any,
     state: Any,
 ) -> None:
     """Steps the active environments' `MjData` and reads their positions and velocities.
@@ -172,10 +173,12 @@ def _advance(
       addresses: `[M, 2]`, where each `MjModel` and `MjData` lies.
       parts: MuJoCo's names of what is written (controls) and read (motion).
       action: `[M, A]`; control: `[A]`, room for one row of it in double precision.
+      begun: `[M, 2]` gets the first two positions before the step.
       state: `[M, nq + nv]`.
     """
     for i in range(len(addresses)):
         if active[i]:
+            begun[i, 0], begun[i, 1] = state[i, 0], state[i, 1]
             model, data = addresses[i]
             for j in range(len(control)):
                 control[j] = action[i, j]

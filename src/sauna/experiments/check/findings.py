@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ SLOW = 200.0  # env steps per second
 FIRST = "mend that first"
 HELP = "see Gymnasium's page on environments of one's own"
 FEW = 3  # episodes that say something about how they end
+SHORT = 10  # steps; episodes below that may well end together by themselves
 # What Gymnasium's checker says of matters that are looked at here, or are none for a training.
 ELSEWHERE = ("is wrapped", "render", "infinity", "from the unwrapped", "symmetric and normalized")
 
@@ -144,9 +146,11 @@ def _facts(env: Any, seen: Played) -> list[str]:
         ended += f" after {min(seen.lengths)} to {max(seen.lengths)} steps"
     reward = f"{np.mean(seen.rewards):g} +- {np.std(seen.rewards):g}"
     rate = seen.steps / max(seen.seconds, 1e-9)
+    steps = _limit(env)
+    limit = f"time limit of {steps} steps" if steps else "no time limit is registered"
     return [
         f"{seen.steps:,} steps with random actions: {ended}; reward {reward} a step",
-        f"{rate:,.0f} steps per second in one process; time limit {_limit(env) or 'none'}",
+        f"{rate:,.0f} steps per second in one process; {limit}",
     ]
 
 
@@ -193,13 +197,32 @@ def _ends(env: Any, seen: Played) -> Iterator[Finding]:
             f"no episode ended in {seen.steps:,} steps, and there is no time limit",
             "register it with max_episode_steps, or wrap it in gymnasium.wrappers.TimeLimit",
         )
-    same = len(seen.lengths) >= FEW and len(set(seen.lengths)) == 1 and all(seen.terminated)
-    if same and seen.lengths[0] > 1:
+    if text := _as_by_a_limit(seen):
         yield Finding(
             WARNING,
-            f"all episodes end as terminated after {seen.lengths[0]} steps, as if by a time limit",
+            f"{text}, as if by a time limit",
             "return truncated=True at a time limit: terminated says that nothing comes after it",
         )
+
+
+def _as_by_a_limit(seen: Played) -> str:
+    """Says which episodes end as terminated at one and the same length, the longest."""
+    longest = max(seen.lengths, default=0)
+    ends = [
+        end for length, end in zip(seen.lengths, seen.terminated, strict=True) if length == longest
+    ]
+    if longest < 2 or len(ends) < FEW or not all(ends):
+        return ""
+    if len(ends) == len(seen.lengths):
+        return f"all episodes end as terminated after {longest} steps"
+    # Lengths that vary by themselves do not heap at the longest one.
+    others = Counter(length for length in seen.lengths if longest / 2 < length < longest)
+    if longest < SHORT or len(ends) < FEW * max(others.values(), default=1):
+        return ""
+    return (
+        f"{len(ends)} of {len(seen.lengths)} episodes end as terminated after exactly {longest} "
+        f"steps, and none is longer"
+    )
 
 
 def _speed(env: Any, seen: Played) -> Iterator[Finding]:

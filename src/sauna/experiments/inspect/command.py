@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from sauna.config.code import changed_code, code_of
 from sauna.config.imported_from import names_the_folder
+from sauna.config.own_sources import newer_sources
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
@@ -31,6 +33,8 @@ def inspect(
 ) -> Path:
     """Plays episodes with a member's policy and writes one self-contained page about them.
 
+    The run's rule is asked as its code is today.
+
     Args:
       run: the run directory.
       member: name or index; default the first.
@@ -40,7 +44,8 @@ def inspect(
       frames: draw the environment; where that fails, one line says so and the page has none.
       max_steps: env steps after which an episode that has not ended is cut.
       trust: the code that the run names may run, even if another user named it.
-      say: receives a line for each checkpoint that cannot be trusted, and for missing frames.
+      say: receives a line for each checkpoint that cannot be trusted, for missing frames, and if
+        today's code, which is asked, is not that of the run.
 
     Returns:
       the page.
@@ -51,7 +56,9 @@ def inspect(
     run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
-    run_directory.read_config(run, needed=())  # an exported policy does not know how it learned
+    stored = run_directory.read_config(
+        run, needed=()
+    )  # an exported policy does not know how it learned
     artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"
@@ -62,5 +69,9 @@ def inspect(
     from sauna.experiments.inspect.page import make_page
 
     found = examine(run, artifact, name, episodes, deterministic, seed, frames, say, max_steps)
+    before, now = stored.get("code", {}), code_of(stored)
+    differs = (changed_code(before, now) or newer_sources(before, now)) if before else ""
+    if differs:
+        say(f"warning: the rule is asked with today's code, the run had other code: {differs}")
     replace_file(path, make_page(found, run).encode())
     return path

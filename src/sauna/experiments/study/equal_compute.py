@@ -12,14 +12,15 @@ from sauna.experiments.statistics import mean_interval
 from sauna.experiments.study.cells import Cell
 
 ABOUT = (
-    "Learner compute is the number of samples through the gradient. The ratio is that of the first "
-    "points where the two mean curves reach the baseline's mean final return. The interval is a "
-    "percentile bootstrap over seeds, too narrow with few of them; no verdict rests on it. No "
-    "ratio is given if the baseline has one seed, or if its return has not risen by more than its "
-    "noise. "
+    "Each sentence says how much compute of the learner an arm takes until its mean curve first "
+    "reaches the baseline's mean final return, as a multiple of what the baseline itself takes "
+    "until then: 0.5 is half of it. Compute is counted in samples that pass through the gradient, "
+    "and in CPU seconds of the learner. The interval is a percentile bootstrap over seeds, too "
+    "narrow with few of them; no verdict rests on it. Nothing is said if the baseline has one "
+    "seed, or if its return has not risen by more than its noise. "
     "CPU seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
-WORDS = {"samples_backward": "learner compute", "learner_cpu_seconds": "learner CPU seconds"}
+WORDS = {"samples_backward": "in samples", "learner_cpu_seconds": "in CPU seconds"}
 
 
 def curves_over(cell: Cell, axis: str) -> Curves | None:
@@ -89,13 +90,16 @@ def _text(cell: Cell, base: Cell, ratios: dict[str, Ratio]) -> str:
     goal = f"{base.label}'s final return on {cell.task}"
     if all(ratio == (None, None, None) for ratio in ratios.values()):
         return f"{cell.label}: does not reach {goal}."
-    said = " and ".join(_share(r, f"{base.label}'s {WORDS[axis]}") for axis, r in ratios.items())
+    said = "; ".join(f"{WORDS[axis]} {_share(ratio)}" for axis, ratio in ratios.items())
     if any(None in ratio for ratio in ratios.values()):
-        return f"{cell.label}: not decided how much it takes to reach {goal}: {said}."
-    return f"{cell.label}: reaches {goal} with {said}."
+        return f"{cell.label}: not decided with how much compute it reaches {goal}: {said}."
+    return f"{cell.label}: reaches {goal} with this multiple of {base.label}'s compute: {said}."
 
 
-def _share(ratio: Ratio, words: str) -> str:
-    value, low, high = ("not reached" if v is None else f"{v:.2f}" for v in ratio)
-    of = f"{value} by the mean, of {words}" if ratio.value is None else f"{value} of {words}"
-    return f"{of}, no interval" if ratio.low is None else f"{of} [{low}, {high}]"
+def _share(ratio: Ratio) -> str:
+    """`0.25, between 0.20 and 0.31`; an end that no resample has is `never`."""
+    value = "the mean curve never gets there" if ratio.value is None else f"{ratio.value:.2f}"
+    if ratio.low is None:
+        return f"{value}, without an interval"
+    high = "never" if ratio.high is None else f"{ratio.high:.2f}"
+    return f"{value} (interval from {ratio.low:.2f} to {high})"

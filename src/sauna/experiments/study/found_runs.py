@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 from sauna.config.code import changed_code, code_of
 from sauna.config.own_sources import newer_sources
+from sauna.config.rule_sources import unknown_rules
 from sauna.experiments.study.units import Unit, parts
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import damage_of
+from sauna.training.display import counted
+
+NAMED = 5  # runs in a warning
 
 
 def check_same_code(
     units: list[Unit], folder: Path, accept: bool, say: Callable[[str], None]
 ) -> None:
     """Refuses to take results of other code for those of today's; a newer version is named.
+
+    A built-in rule that was edited counts as other code, committed or not.
 
     Args:
       accept: the user has said that they count as today's; the runs note both.
@@ -26,6 +33,7 @@ def check_same_code(
       BadInput: naming what changed.
     """
     newer: Counter[str] = Counter()
+    unsure: list[Path] = []  # of another version, which noted no source of its rule
     for unit in (part for whole in units for part in parts(whole, folder)):
         run = unit.run(folder)
         if not (run / "config.json").is_file():
@@ -36,14 +44,24 @@ def check_same_code(
         if changed and not accept:
             raise BadInput(
                 f"{run} was trained with other code: {changed}; --accept-changed-code takes such "
-                f"runs as they are, another --out trains them anew"
+                f"runs as they are, another --out trains all runs anew, rm -r "
+                f"{shlex.quote(str(run))} only this one"
             )
         if changed:
             run_directory.write_config(run, run_directory.with_code(stored, now))
         elif text := newer_sources(stored.get("code", {}), now):
             newer[text] += 1
+            unsure += [run] * bool(unknown_rules(stored.get("code", {}), now))
     for text, number in newer.items():
-        say(f"note: reused: {number} runs of {text}; another --out trains them anew")
+        say(f"note: reused: {counted(number, 'run')} of {text}; another --out trains them anew")
+    if unsure:
+        named, more = shlex.join(map(str, unsure[:NAMED])), len(unsure) - NAMED
+        say(
+            f"warning: {counted(len(unsure), 'reused run')} did not note the source of the rule; "
+            f"if you edited it since, train anew: rm -r {named}"
+            + f" (and {more} more)"
+            * (more > 0)
+        )
 
 
 def reopen_damaged(units: list[Unit], folder: Path, say: Callable[[str], None]) -> None:

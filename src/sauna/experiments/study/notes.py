@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from sauna.config.checks import budget_note
 from sauna.config.parsing import many_seeds
-from sauna.config.settings import flag, to_json
-from sauna.config.zoo import entry_for
+from sauna.config.presets import chosen_preset
+from sauna.config.settings import Config, flag, to_json
+from sauna.config.zoo import entry_for, entry_of
 from sauna.experiments.statistics import compare
 from sauna.experiments.study.cells import Cell
 from sauna.experiments.study.spec import Arm, Spec, check
@@ -21,9 +23,32 @@ def before_training(spec: Spec, seeds: str = "seeds") -> list[str]:
     """
     notes = [note for arm in spec.arms if (note := many_seeds(arm.seeds))]
     notes += [note for arm in spec.arms for note in _picked(arm)]
+    notes += [note for arm in spec.arms for task in arm.tasks for note in _of_config(arm, task)]
     for task in spec.tasks:
         notes += _too_few(task, {arm.label: arm for arm in spec.arms if task in arm.tasks}, seeds)
     return list(dict.fromkeys(notes))
+
+
+def _of_config(arm: Arm, task: str) -> list[str]:
+    """Says which preset stands where none is named, and how far a small budget reaches."""
+    config = check(arm, task)
+    notes = [budget_note(config)]
+    if "preset" not in arm.settings:
+        notes.append(_unnamed(chosen_preset(arm.settings), config, task, "steps" in arm.settings))
+    return [note for note in notes if note]
+
+
+def _unnamed(preset: str, config: Config, task: str, has_steps: bool) -> str:
+    """Says which preset and how many env steps are taken, and which the zoo has for the task."""
+    entry = entry_of(task)
+    taken = f"note: no preset is named: {preset} is taken"
+    taken += "" if has_steps else f", with {config.steps:,} env steps"
+    if entry is None or config.algorithm != Config.algorithm:
+        return taken
+    if entry.preset == preset and (has_steps or entry.steps == config.steps):
+        return f"{taken}, as for {task} in the zoo"
+    steps = "" if has_steps else f", with {entry.steps:,} env steps"
+    return f"{taken}; preset auto is {entry.preset} for {task}{steps}"
 
 
 def _picked(arm: Arm) -> list[str]:

@@ -25,6 +25,7 @@ from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
+from sauna.experiments.study.verdicts import seeds_needed
 from sauna.system.safe_write import replace_file
 from sauna.training.display import counted
 
@@ -94,6 +95,8 @@ def make_page(
         ablation=summary.get("about_filtering", ""),
         ranking=tables.ranking(summary),
         ranking_about=RANKING,
+        seeds_needed=seeds_needed([*summary["verdicts"], *summary["filtering"]]),
+        few_episodes=tables.few_episodes(summary["table"]),
         equal_compute_about=EQUAL_COMPUTE,
         by_compute=[(plot, _panels(plot, looks)) for plot in compute_plots(summary)],
         marks=MARKS,

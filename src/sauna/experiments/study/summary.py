@@ -175,6 +175,9 @@ def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
         "env_steps": cell.mean("env_steps"),
         "kept_steps": cell.mean("kept_steps"),
         "samples_backward": cell.mean("samples_backward"),
+        "fewest_episodes": min(
+            (m["episodes"] for m in cell.complete if m.get("episodes")), default=None
+        ),
         "improvement": list(comparison.improvement) if comparison else None,
         **({"stopped_early": stopped} if stopped else {}),
     }

@@ -9,6 +9,7 @@ from typing import Any
 from sauna.experiments.report.numbers import digits_of, digits_of_tasks
 from sauna.experiments.report.page import MINUS
 from sauna.experiments.report.style import Look
+from sauna.training.summary import WINDOW
 
 PAPER_STEPS = 1_000_000  # env steps of each of its trainings
 # Table 1 of the SAUNA paper, as printed.
@@ -38,6 +39,22 @@ FORMER_KEYS = {"auc": "area"}  # in results of 0.1.0
 def has_samplers(table: Sequence[Mapping[str, Any]]) -> bool:
     """Returns whether an arm has a sampler, so that the share of samples it uses is shown."""
     return any(row.get("sampler", "none") != "none" for row in table)
+
+
+def few_episodes(table: Sequence[Mapping[str, Any]]) -> str:
+    """Says which arms have a seed with fewer episodes than a final return covers; empty if none."""
+    few = [row for row in table if (row.get("fewest_episodes") or WINDOW) < WINDOW]
+    tasks = len({row["task"] for row in table}) > 1
+    parts = [
+        f"{row['label']}{' on ' + row['task'] if tasks else ''} {row['fewest_episodes']}"
+        for row in few
+    ]
+    return (
+        f"note: a seed has fewer than {WINDOW} episodes ({', '.join(parts)}): its final return is "
+        f"the mean of all of them, from the untrained policy on; more --steps give more"
+        if parts
+        else ""
+    )
 
 
 def main_columns(baseline: str, sampled: bool) -> dict[str, str]:

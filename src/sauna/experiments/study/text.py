@@ -8,7 +8,8 @@ from typing import Any
 from sauna.experiments.report.numbers import aligned, digits_of_tasks, interval, number
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
 from sauna.experiments.study.ranking import ABOUT as RANKING
-from sauna.experiments.study.tables import has_samplers
+from sauna.experiments.study.tables import few_episodes, has_samplers
+from sauna.experiments.study.verdicts import seeds_needed
 
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
@@ -34,10 +35,13 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     if summary["filtering"]:
         ablation = "Ablation of the selection rule. " + summary["about_filtering"]
         said += ["", ablation, *(v["text"] for v in summary["filtering"])]
+    if seeds := seeds_needed([*summary["verdicts"], *summary["filtering"]]):
+        said += ["", seeds]
     if equal := summary.get("equal_compute"):
         said += ["", "At equal compute. " + EQUAL_COMPUTE, *(v["text"] for v in equal)]
     said += summary.get("measured", [])
-    return [*aligned(rows), "", *said]
+    few = few_episodes(summary["table"])
+    return [*aligned(rows), *([few] if few else []), "", *said]
 
 
 def ranking_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -195,8 +195,32 @@ def _verdict(
         "against": base.label,
         "kind": comparison.kind,
         "chance": comparison.improvement.value,
+        "needed": _needed(cell, base, comparison),
         "text": text,
     }
+
+
+def _needed(cell: Cell, base: Cell, comparison: Comparison) -> str | None:
+    """How many seeds of each would decide a difference as large as the one seen, if more."""
+    fewest = min(len(c.scores()) for c in (cell, base))
+    few = comparison.needed is None or comparison.needed <= fewest
+    return None if comparison.kind != "no evidence" or few else _about(int(comparison.needed or 0))
+
+
+def seeds_needed(verdicts: Sequence[Mapping[str, Any]]) -> str:
+    """Says once how many seeds would decide what is not decided; empty if nothing is known."""
+    known = [verdict for verdict in verdicts if verdict.get("needed")]
+    tasks = len({verdict["task"] for verdict in known}) > 1
+    parts = [
+        f"{v['label']} against {v['against']}{' on ' + v['task'] if tasks else ''} {v['needed']}"
+        for v in known
+    ]
+    return (
+        f"Seeds of each arm that would decide a difference as large as the one seen: "
+        f"{', '.join(parts)}. These are rough orders of magnitude ({POWER:.0%} power)."
+        if parts
+        else ""
+    )
 
 
 def _family(number: int, what: str) -> str:
@@ -247,18 +271,12 @@ def _limits(cell: Cell, base: Cell, comparison: Comparison, tasks: int) -> list[
     kind, (chance, low, high) = comparison.kind, comparison.improvement
     if kind in ("underpowered", "too many failed") or chance is None or low is None or high is None:
         return []
-    n, m = (len(c.scores()) for c in (cell, base))
     if kind == "no evidence":
         said = []
         if not low <= 0.5 <= high:
             said.append("The interval leaves out 0.5, but the test, which decides, does not.")
         elif comparison.p < ALPHA:
             said.append("The test rejects, but the interval, which has to agree, holds 0.5.")
-        if comparison.needed is not None and comparison.needed > min(n, m):
-            said.append(
-                f"Were the difference seen the true one, {_about(comparison.needed)} seeds of "
-                f"each would be needed to find it ({POWER:.0%} power; a rough order of magnitude)."
-            )
         return said
     said = [f"This is not corrected for the {tasks} tasks."] if tasks > 1 else []
     above = (cell.mean("final_return") or 0.0) - (base.mean("final_return") or 0.0)
