@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.config.stored import read_stored
 from sauna.experiments.curves import area_under_curve
 from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.study.execute.process import Message, UnitProcess
@@ -39,6 +40,12 @@ class Item(NamedTuple):
     points: list[float]  # of the measurement's points, those that have a checkpoint of their own
     iterations: list[int]
     files: list[Path]
+
+    @property
+    def member(self) -> str:
+        """Its name in its run."""
+        members = read_stored(run_directory.read_config(self.run)).members
+        return next(member.name for member in members if member.seed == self.seed)
 
     @property
     def is_done(self) -> bool:
@@ -131,7 +138,7 @@ def scale_of(spec: Spec, items: list[Item], task: str) -> dict[str, Any] | None:
     for item in items:
         if (item.task, item.label, item.seed) == (task, spec.baseline, first) and item.iterations:
             last = max(item.iterations)
-            return {"run": str(item.run), "member": f"{item.arm}/{item.seed}", "iteration": last}
+            return {"run": str(item.run), "member": item.member, "iteration": last}
     return None
 
 
@@ -206,7 +213,7 @@ def _start(
     given = {
         "compute": measurement.compute,
         "run": str(item.run),
-        "member": f"{item.arm}/{item.seed}",
+        "member": item.member,
         "iterations": item.iterations,
         "files": [str(file) for file in item.files],
         "scale": scale,
