@@ -161,8 +161,9 @@ class RunConfig(NamedTuple):
     @property
     def labels(self) -> dict[str, str]:
         """Names each arm as its members are: `ppo+my_module.rule` if the rule is the user's own."""
-        name = label_of if self.names_rules else (lambda arm, own: arm)
-        return {arm: name(arm, vars(self.arms[arm])) for arm in self.config.arm}
+        if not self.names_rules:
+            return {arm: arm for arm in self.config.arm}
+        return {arm: label_of(arm, vars(self.arms[arm])) for arm in self.config.arm}
 
     def replace(self, **changes: Any) -> RunConfig:
         """Changes settings of the program and of all arms."""
@@ -193,7 +194,7 @@ def resolve_run(overrides: Mapping[str, Any]) -> RunConfig:
         _check_same_program(arm, config, shared)
     check_consistent(shared)
     own = {arm: _member_config(config, shared) for arm, config in configs.items()}
-    return RunConfig(shared, own, names_rules=True)
+    return RunConfig(shared, own, any(arm != label_of(arm, vars(c)) for arm, c in own.items()))
 
 
 def parse_all(overrides: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,8 +24,7 @@ def to_stored(run: RunConfig) -> dict[str, Any]:
         arm: {name: value for name, value in to_json(config).items() if value != shared[name]}
         for arm, config in run.arms.items()
     }
-    named = any(arm != label for arm, label in run.labels.items())
-    return {"config": shared, "arms": arms, **({NAMES_RULES: True} if named else {})}
+    return {"config": shared, "arms": arms, **({NAMES_RULES: True} if run.names_rules else {})}
 
 
 def read_stored(stored: Mapping[str, Any]) -> RunConfig:
