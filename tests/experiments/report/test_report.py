@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -25,6 +26,7 @@ from sauna.experiments.report.readout import read_out
 from sauna.experiments.study import tables
 from sauna.experiments.study.report import make_page, question, write_report
 from sauna.experiments.study.summary import summarize
+from sauna.experiments.study.text import lines
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$x$"
 ERROR = "NotFinite: the loss of <member> is nan\n  at iteration 3"
@@ -309,6 +311,34 @@ def test_figures_hold_what_there_is(report) -> None:
     assert curves["ppo"].y == summary["curves"]["HalfCheetah-v5"]["ppo"]["return_mean"]["mean"]
     files = {file.name for file in (path.parent / "figures").iterdir()}
     assert files == {f"{name}.{kind}" for name in names for kind in ("png", "svg")}
+
+
+def test_evaluations_stand_beside_the_training_return() -> None:
+    """Of three arms: one played its most likely actions, one sampled, one was not evaluated."""
+    results = make_results(("HalfCheetah-v5",))
+    for cell, mode, level in zip(results["cells"][:2], (True, False), (100.0, 400.0), strict=True):
+        cell["config"] |= {"eval_deterministic": mode, "eval_episodes": 10}
+        for one in cell["members"]:
+            ends = [0.5 * level + one["seed"], level + 10 * one["seed"]]
+            one["evaluations"] = {"env_steps": [50_000, 100_000], "return_mean": ends}
+            one |= {"eval_return": ends[1], "eval_return_best": level + 50}
+    page, summary = page_of(results)
+    plots = plots_of(results, summary)
+    assert [plot.name for plot in plots[:2]] == ["learning_curves", "evaluations"]
+    ppo, head = plots[1].panels[0].lines
+    assert (ppo.label, ppo.x, ppo.y) == ("ppo", [50_000, 100_000], [52.0, 120.0])
+    assert head.y == [202.0, 420.0] and [seed for seed, *_ in head.seeds] == [0, 1, 2, 3, 4]
+    assert "10 episodes with deterministic actions, the most likely ones (ppo)" in plots[1].caption
+    assert "10 episodes with sampled actions (vex-head)" in plots[1].caption
+    assert plots[1].caption in page.text
+    row, none = summary["table"][0], summary["table"][2]
+    assert row["eval_mean"] == 120.0 and row["eval_std"] == np.std([0, 10, 20, 30, 40], ddof=1)
+    assert "eval_mean" not in none
+    assert [120.0, row["eval_std"]] in page.exact("ppo")[0]
+    assert "Last evaluation, mean ± std" in page.text and "Best evaluation" in page.text
+    assert " last evaluation " in lines(summary)[0]
+    plain, _ = page_of(make_results(("HalfCheetah-v5",)))
+    assert "evaluation" not in plain.text.lower()
 
 
 def test_the_same_input_gives_the_same_bytes(report, tmp_path) -> None:

@@ -196,6 +196,21 @@ def test_a_comparison_says_where_each_arm_ends_and_writes_a_report(tmp_path: Pat
     assert not (tmp_path / "none").exists()
 
 
+def test_evaluations_of_runs_are_compared_up_to_the_same_env_steps(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    of_ppo = [row for row in rows if row["arm"] == "ppo" and row["env_steps"] > 100]
+    for row in of_ppo:
+        row["eval_return_mean"] = row["env_steps"] + 10.0 * row["seed"]
+    rows.remove(of_ppo[-1])  # the other seed is cut at 200 env steps, too
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    results = results_of(read_sources([run]), "")
+    ppo, sauna = (cell["members"] for cell in results["cells"])
+    assert [one["evaluations"]["env_steps"] for one in ppo] == [[200], [200]]
+    assert [one["eval_return"] for one in ppo] == [200.0, 210.0]
+    assert not any("evaluations" in one for one in sauna)
+
+
 def test_runs_are_plotted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run, other = write_run(tmp_path / "run"), write_csv(tmp_path / "other.csv", 9.0, 3000)

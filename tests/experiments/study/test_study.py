@@ -135,6 +135,15 @@ def test_a_member_that_stopped_early_keeps_its_last_return() -> None:
     assert _ended(rows, 400)["auc"] == 1.5
 
 
+def test_a_members_evaluations_are_in_its_results() -> None:
+    rows: list[dict[str, Any]] = [{"env_steps": n, "return_mean": 0.0} for n in (100, 200, 300)]
+    assert not {"evaluations", "eval_return"} & set(_ended(rows, 300))
+    rows[0]["eval_return_mean"], rows[2]["eval_return_mean"] = 7.12345678, 3.0
+    ended = _ended(rows, 300)
+    assert (ended["eval_return"], ended["eval_return_best"]) == (3.0, 7.12345678)
+    assert ended["evaluations"] == {"env_steps": [100, 300], "return_mean": [7.12346, 3.0]}
+
+
 def test_files_are_read_and_their_mistakes_named(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('tasks = ["A-v0"]\nseeds = [4, 9]\nsteps = 1e5\n[[arms]]\nlabel = "ppo"\n')

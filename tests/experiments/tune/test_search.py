@@ -244,7 +244,6 @@ def test_the_fresh_seeds_compare_with_the_preset_that_the_task_has_by_itself() -
         (["A-v0", "--population-based", "--pruner", "none"], "pruner: not read with population"),
         (["A-v0", "--population-based", "--trials", "1"], "needs at least 2 members"),
         (["A-v0", "--space", "none.toml"], "no file none.toml"),
-        (["A-v0", "--on", "ray", "--population-based"], "on: a population is one program"),
         (["A-v0", "--address", "auto"], "address: read with --on ray only"),
         (["CartPole-v1", "--arm", "ppo,sauna"], "arm: a tuning has one arm"),
         (["CartPole-v1", "--init-from", "runs/x"], "init_from: not read by a tuning"),

@@ -151,6 +151,7 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
         )
         for name, metric, title, caption, y_label, limits in _CURVES
     ]
+    plots[1:1] = _evaluation_plots(results, summary)  # beside the learning curves
     caption = (
         "Share of the seeds whose final return is at least x; band: 95% interval, which has "
         "no width where all seeds or none reach x, and is no certainty there."
@@ -167,6 +168,61 @@ def plots_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plo
         )
     )
     return [plot for plot in plots if any(panel.lines for panel in plot.panels)]
+
+
+def about_evaluations(results: Mapping[str, Any]) -> str:
+    """Says how the evaluations of a study were played; empty if there are none."""
+    how: dict[str, list[str]] = {}
+    for cell in results["cells"]:
+        if any("evaluations" in member for member in cell["members"]):
+            config = cell.get("config") or {}
+            labels = how.setdefault(_as_played(config), [])
+            labels += [cell["label"]] if cell["label"] not in labels else []
+    if not how:
+        return ""
+    said = [
+        text + (f" ({', '.join(labels)})" if len(how) > 1 else "") for text, labels in how.items()
+    ]
+    return (
+        f"mean return of {'; '.join(said)}, in environments of their own, while the members trained"
+    )
+
+
+def _as_played(config: Mapping[str, Any]) -> str:
+    how = {True: "deterministic actions, the most likely ones", False: "sampled actions"}
+    mode = how.get(config.get("eval_deterministic", ""), "actions of an unknown kind")
+    return f"{config.get('eval_episodes', 'some')} episodes with {mode}"
+
+
+def _evaluation_plots(results: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Plot]:
+    """The curves of the evaluations, of the arms all of whose complete seeds have some."""
+    panels = [
+        Panel(
+            task,
+            [
+                Line(label, c["env_steps"], c["mean"], c["low"], c["high"], seeds)
+                for label, c in of_label.items()
+                if (seeds := _evaluated_seeds(results, task, label)) and _any(c["mean"])
+            ],
+        )
+        for task, of_label in summary.get("evaluations", {}).items()
+    ]
+    about = about_evaluations(results)
+    caption = f"{about[:1].upper()}{about[1:]}. Lines and bands are those of the learning curves."
+    title = "Evaluations while training"
+    return [Plot("evaluations", title, caption, "env steps", "return", None, panels)]
+
+
+def _evaluated_seeds(
+    results: Mapping[str, Any], task: str, label: str
+) -> list[tuple[int, Numbers, Numbers]]:
+    return [
+        (member["seed"], found["env_steps"], found["return_mean"])
+        for cell in results["cells"]
+        if (cell["task"], cell["label"]) == (task, label)
+        for member in cell["members"]
+        if member["status"] == "complete" and (found := member.get("evaluations"))
+    ]
 
 
 def compute_plots(summary: Mapping[str, Any]) -> list[Plot]:

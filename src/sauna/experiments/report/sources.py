@@ -30,11 +30,15 @@ MAX_EVENT = 1 << 24  # bytes of an event that is read: scalars take less than a 
 
 
 class Curve(NamedTuple):
-    """One seed's returns `y` over env steps `x`, `[n]` each; env steps rise."""
+    """One seed's returns `y` over env steps `x`, `[n]` each; env steps rise.
+
+    `evaluations` are the rows of `metrics.jsonl` that have one.
+    """
 
     x: np.ndarray
     y: np.ndarray
     keep_rate: float | None = None
+    evaluations: Sequence[Mapping[str, Any]] = ()
 
 
 class Source(NamedTuple):
@@ -133,7 +137,8 @@ def _read_run(run: Path) -> list[Source]:
 def _of_rows(rows: list[dict[str, Any]]) -> Curve:
     kept, last = rows[-1].get("kept_steps"), rows[-1]["env_steps"]
     x, y = (np.array([row[name] for row in rows], float) for name in ("env_steps", "return_mean"))
-    return Curve(x, y, kept / last if kept is not None and last else None)
+    evaluations = [row for row in rows if "eval_return_mean" in row]
+    return Curve(x, y, kept / last if kept is not None and last else None, evaluations)
 
 
 def _read_csv(path: Path) -> list[Source]:

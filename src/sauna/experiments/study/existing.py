@@ -14,6 +14,7 @@ from sauna.experiments.curves import area_under_curve
 from sauna.experiments.report.sources import Curve, Source, read_sources
 from sauna.experiments.report.style import short
 from sauna.experiments.study.command import lines
+from sauna.experiments.study.evaluations import evaluated
 from sauna.experiments.study.report import write_report
 from sauna.experiments.study.results import DIGITS, FORMAT, POINTS
 from sauna.experiments.study.summary import summarize
@@ -146,6 +147,7 @@ def _member(seed: int, curve: Curve, end: float) -> dict[str, Any]:
         "keep_rate": curve.keep_rate,
         "episodes": None,
         "explained_variance": None,
+        **evaluated([r for r in curve.evaluations if r["env_steps"] <= end], POINTS, DIGITS),
         "curve": {
             "env_steps": [float(step) for step in x[chosen]],
             "return_mean": [float(f"{value:.{DIGITS}g}") for value in y[chosen]],

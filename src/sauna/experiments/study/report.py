@@ -13,6 +13,7 @@ from sauna.experiments.report.figures import (
     Panel,
     Plot,
     Section,
+    about_evaluations,
     compute_plots,
     looks_of,
     panel_svg,
@@ -24,6 +25,7 @@ from sauna.experiments.report.readout import read_out
 from sauna.experiments.report.style import Look, short
 from sauna.experiments.study import tables
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
+from sauna.experiments.study.evaluations import has_evaluations
 from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.verdicts import seeds_needed
 from sauna.system.safe_write import replace_file
@@ -104,9 +106,14 @@ def make_page(
         unfolded=UNFOLDED,
         totals=totals,
         pairs=pairs,
-        columns=tables.main_columns(results["baseline"], tables.has_samplers(summary["table"])),
+        columns=tables.main_columns(
+            results["baseline"],
+            tables.has_samplers(summary["table"]),
+            has_evaluations(summary["table"]),
+        ),
         groups=tables.main_groups(summary, looks),
         metric=results["metric"],
+        evaluation=about_evaluations(results),
         baseline=results["baseline"],
         looks={label: look for label, look in looks.items() if label in drawn},
         figures=[(plot, _panels(plot, looks)) for plot in plots],

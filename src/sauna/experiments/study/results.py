@@ -13,6 +13,7 @@ import numpy as np
 from sauna.config.settings import flag, to_json
 from sauna.experiments.compute import cumulated, learner_seconds
 from sauna.experiments.curves import area_under_curve
+from sauna.experiments.study.evaluations import evaluated
 from sauna.experiments.study.rounds import tournament_of
 from sauna.experiments.study.spec import Arm, Spec, check
 from sauna.experiments.study.units import Unit, parts
@@ -169,6 +170,7 @@ def _ended(
         "episodes": last.get("episodes"),
         "explained_variance": last.get("explained_variance"),
         **{name: _short(values[-1]) for name, values in compute.items()},
+        **evaluated(rows, POINTS, DIGITS),
         "curve": _curve(rows, compute),
     }
 

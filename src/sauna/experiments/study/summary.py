@@ -26,6 +26,7 @@ from sauna.experiments.statistics import (
 from sauna.experiments.study import ranking
 from sauna.experiments.study.cells import Cell
 from sauna.experiments.study.equal_compute import by_compute, compute_verdicts
+from sauna.experiments.study.evaluations import evaluation_curve, last_evaluations
 from sauna.experiments.study.verdicts import (
     ABLATION,
     CONTROL,
@@ -86,6 +87,12 @@ def summarize(results: Mapping[str, Any]) -> dict[str, Any]:
         "equal_compute": [v for own in of_task.values() for v in compute_verdicts(own)],
         "by_compute": {task: by_compute(own) for task, own in of_task.items()},
     }
+    evaluations = {
+        task: {c.label: curve for c in own if (curve := evaluation_curve(c, GRID)) is not None}
+        for task, own in of_task.items()
+    }
+    if any(evaluations.values()):
+        summary["evaluations"] = evaluations
     if "tournament" in results:
         rows = ranking.rank(results)
         summary |= {
@@ -179,6 +186,7 @@ def _row(cell: Cell, comparison: Comparison | None) -> dict[str, Any]:
             (m["episodes"] for m in cell.complete if m.get("episodes")), default=None
         ),
         "improvement": list(comparison.improvement) if comparison else None,
+        **last_evaluations(cell),
         **({"stopped_early": stopped} if stopped else {}),
     }
 

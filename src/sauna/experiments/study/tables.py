@@ -28,11 +28,14 @@ SEED_COLUMNS = {
     "sample_rate": "Samples used",
     "explained_variance": "Explained variance",
     "env_steps": "Env steps",
+    "eval_return": "Last evaluation",
+    "eval_return_best": "Best evaluation",
     "kept_steps": "Kept steps",
     "episodes": "Episodes",
     "samples_backward": "Samples learned from",
     "learner_cpu_seconds": "Learner CPU seconds",
 }
+OF_EVALUATIONS = ("eval_return", "eval_return_best")  # left out where no member has any
 FORMER_KEYS = {"auc": "area"}  # in results of 0.1.0
 
 
@@ -57,20 +60,26 @@ def few_episodes(table: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def main_columns(baseline: str, sampled: bool) -> dict[str, str]:
-    """Returns the columns of the main table, `sampled` with the share of samples used."""
+def main_columns(baseline: str, sampled: bool, evaluated: bool) -> dict[str, str]:
+    """Returns the columns of the main table.
+
+    Args:
+      sampled: with the share of samples used; evaluated: with the last evaluations.
+    """
     columns = {
         "arm": "Arm",
         "final_iqm": "Final return, IQM",
         "improvement": f"Better than {baseline}",
         "auc_iqm": "AUC, IQM",
         "final_mean": "Final return, mean ± std",
+        "eval_mean": "Last evaluation, mean ± std",
         "keep_rate": "Keep rate",
         "sample_rate": "Samples used",
         "env_steps": "Env steps",
         "seeds": "Seeds",
     }
-    return {name: text for name, text in columns.items() if sampled or name != "sample_rate"}
+    left = {"sample_rate": sampled, "eval_mean": evaluated}
+    return {name: text for name, text in columns.items() if left.get(name, True)}
 
 
 def main_groups(summary: Mapping[str, Any], looks: Mapping[str, Look]) -> list[dict[str, Any]]:
@@ -148,6 +157,9 @@ def failures(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def settings(results: Mapping[str, Any]) -> dict[str, Any]:
     """Returns every setting: of each cell, and of what the study itself ran on."""
     base = {c["task"]: c for c in results["cells"] if c["label"] == results["baseline"]}
+    members = [member for cell in results["cells"] for member in cell["members"]]
+    evaluated = any("eval_return" in member for member in members)
+    columns = [name for name in SEED_COLUMNS if evaluated or name not in OF_EVALUATIONS]
     groups = [
         (name, values)
         for name in ("settings", "versions", "machine")
@@ -155,14 +167,16 @@ def settings(results: Mapping[str, Any]) -> dict[str, Any]:
         for values in (results[name] if isinstance(results[name], list) else [results[name]])
     ]
     return {
-        "cells": [_cell(cell, base.get(cell["task"])) for cell in results["cells"]],
-        "seed_columns": list(SEED_COLUMNS.values()),
+        "cells": [_cell(cell, base.get(cell["task"]), columns) for cell in results["cells"]],
+        "seed_columns": [SEED_COLUMNS[name] for name in columns],
         "git": results["git"],
         "groups": groups,
     }
 
 
-def _cell(cell: Mapping[str, Any], base: Mapping[str, Any] | None) -> dict[str, Any]:
+def _cell(
+    cell: Mapping[str, Any], base: Mapping[str, Any] | None, columns: Sequence[str]
+) -> dict[str, Any]:
     """A cell's command, its seeds one by one, and its settings beside the baseline's."""
     own = {"git revision": cell.get("git"), **cell["config"]}
     beside = base if base is not cell else None
@@ -173,17 +187,17 @@ def _cell(cell: Mapping[str, Any], base: Mapping[str, Any] | None) -> dict[str, 
         "command": cell["command"],
         "baseline": beside["label"] if beside else "",
         "seeds": [
-            {"seed": m["seed"], "status": m["status"], "numbers": _numbers(m)}
+            {"seed": m["seed"], "status": m["status"], "numbers": _numbers(m, columns)}
             for m in cell["members"]
         ],
         "rows": [(k, v, other.get(k) != v, other.get(k)) for k, v in own.items()],
     }
 
 
-def _numbers(member: Mapping[str, Any]) -> list[tuple[Any, int]]:
+def _numbers(member: Mapping[str, Any], columns: Sequence[str]) -> list[tuple[Any, int]]:
     """Each number of a seed, and its decimals."""
     found = []
-    for key in SEED_COLUMNS:
+    for key in columns:
         value = member[key] if key in member else member.get(FORMER_KEYS.get(key, key))
         whole = value is None or isinstance(value, int)
         found.append((value, 0 if whole else max(1, digits_of([value]))))

@@ -7,6 +7,7 @@ from typing import Any
 
 from sauna.experiments.report.numbers import aligned, digits_of_tasks, interval, number
 from sauna.experiments.study.equal_compute import ABOUT as EQUAL_COMPUTE
+from sauna.experiments.study.evaluations import has_evaluations
 from sauna.experiments.study.ranking import ABOUT as RANKING
 from sauna.experiments.study.tables import few_episodes, has_samplers
 from sauna.experiments.study.verdicts import seeds_needed
@@ -14,7 +15,7 @@ from sauna.experiments.study.verdicts import seeds_needed
 
 def lines(summary: Mapping[str, Any]) -> list[str]:
     """Returns the table and the verdicts, as text."""
-    sampled = has_samplers(summary["table"])
+    sampled, evaluated = has_samplers(summary["table"]), has_evaluations(summary["table"])
     head = [
         "task",
         "arm",
@@ -22,13 +23,15 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
         "final return, IQM",
         "AUC, IQM",
         "mean +- std",
+        *(["last evaluation"] if evaluated else []),
         "keep rate",
         *(["samples used"] if sampled else []),
         "env steps",
         "P(improvement)",
     ]
     digits = digits_of_tasks(summary["table"])
-    rows = [head, *(_row(row, digits[row["task"]], sampled) for row in summary["table"])]
+    table = summary["table"]
+    rows = [head, *(_row(row, digits[row["task"]], sampled, evaluated) for row in table)]
     said = [v["text"] for v in summary["verdicts"]]
     if "ranking" in summary:
         said = [*ranking_lines(summary["ranking"]), "", RANKING]
@@ -65,7 +68,7 @@ def ranking_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return aligned(texts)
 
 
-def _row(row: Mapping[str, Any], digits: int, sampled: bool) -> list[str]:
+def _row(row: Mapping[str, Any], digits: int, sampled: bool, evaluated: bool) -> list[str]:
     failed = f" ({row['failed']} failed)" if row["failed"] else ""
     stopped = f" ({row['stopped_early']} stopped early)" if row.get("stopped_early") else ""
     mean, std = number(row["final_mean"], digits), number(row["final_std"], digits)
@@ -76,6 +79,7 @@ def _row(row: Mapping[str, Any], digits: int, sampled: bool) -> list[str]:
         interval(row["final_iqm"], digits),
         interval(row["auc_iqm"], digits),
         f"{mean} +- {std}",
+        *([number(row.get("eval_mean"), digits)] if evaluated else []),
         number(row["keep_rate"], 3),
         *([number(row["sample_rate"], 3)] if sampled else []),
         number(row["env_steps"], 0),

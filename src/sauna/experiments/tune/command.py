@@ -15,6 +15,7 @@ from sauna.experiments.tune.batch import Tuning
 from sauna.experiments.tune.on_cluster import ClusterSearch
 from sauna.experiments.tune.plan import PRUNERS, SEARCHES, Plan, make_plan
 from sauna.experiments.tune.population import Population, check_population
+from sauna.experiments.tune.population_on_cluster import ClusterPopulation
 from sauna.experiments.tune.search import Search
 from sauna.experiments.tune.space import load_space
 from sauna.system import run_directory
@@ -94,7 +95,7 @@ def tune(
     values = load_space(options["space"], trust) if options["space"] else None
     if not options["population_based"]:
         storage.check_installed()
-    _check_where(on, address, options["population_based"])
+    _check_where(on, address)
     out = Path.cwd() / out
     if jobs and on == "local":  # a cluster may have another size when the tuning goes on
         given = {**given, "processes": jobs}
@@ -126,7 +127,7 @@ def tune(
             return _tune(tuning, command, Where(jobs, on, address), say), place
 
 
-def _check_where(on: str, address: str, population: bool) -> None:
+def _check_where(on: str, address: str) -> None:
     """Refuses a place where the tuning cannot train.
 
     Raises:
@@ -135,11 +136,6 @@ def _check_where(on: str, address: str, population: bool) -> None:
     if on == "local":
         if address:
             raise BadInput("address: read with --on ray only")
-    elif population:
-        raise BadInput(
-            "on: a population is one program, whose members wait for each other at every exchange; "
-            "it trains on this machine only"
-        )
     else:
         ray_cluster.check(address)
 
@@ -167,9 +163,11 @@ def _tune(tuning: Tuning, command: str, where: Where, say: Callable[[str], None]
 
 
 def _search(tuning: Tuning, where: Where, say: Callable[[str], None]) -> Search | Population:
+    population = bool(tuning.plan.exchange_every)
     if where.on == "ray":
-        return ClusterSearch(tuning, where.jobs, where.address, say)
-    return (Population if tuning.plan.exchange_every else Search)(tuning)
+        make = ClusterPopulation if population else ClusterSearch
+        return make(tuning, where.jobs, where.address, say)
+    return (Population if population else Search)(tuning)
 
 
 def _raise(number: int) -> None:

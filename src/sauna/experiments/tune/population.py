@@ -9,6 +9,8 @@ exchange that was lost again, the same: draws follow from the seed and the itera
 
     population/run               the run
     population/exchanges.jsonl   every exchange
+
+On a cluster each member is a run of its own: see `population_on_cluster.py`.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import dataclasses
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +36,7 @@ from sauna.system.errors import BadInput
 from sauna.system.safe_write import own_folder, replace_file
 from sauna.training.prepare import Prepared
 
-FOLDER, LOG = "population", "exchanges.jsonl"
+FOLDER, LOG, UNITS = "population", "exchanges.jsonl", "units"
 EXPLOITED = 0.2  # share of the members that are replaced, and of those that are copied
 FACTORS = (0.8, 1.2)  # that change a number
 DRAWN_ANEW = 0.25  # probability with which a setting is drawn from its range instead
@@ -121,25 +123,36 @@ class Population:
         """Trains the population to its end.
 
         Raises:
+          BadInput: it was begun on a cluster, or on this machine and is to go on on one.
           Interrupted: a signal came; running again continues.
           SaunaError: the training failed.
         """
         own_folder(self._folder)
+        self._check_begun()
         whole = {
             arm_of(number): {**self._plan.settings, **settings}
             for number, settings in enumerate(self._first())
         }
         first = prepared_batch(whole, self._plan.seeds, self._start, self._run)
-        if run_directory.is_complete(self._run):
+        at, last = self._begin(first), first.config.steps // self._samples
+        if at is None:
             return
-        last = first.config.steps // self._samples
-        at = self._aligned(first)
         for iteration in range(self._every, last, self._every):
             if iteration > at:
                 self._train(first, iteration)
             if iteration >= at:
                 self._exchange(iteration)
         self._train(first, None)
+
+    def _check_begun(self) -> None:
+        if (self._folder / UNITS).is_dir():
+            raise BadInput("on: this population was begun on a cluster; give --on ray")
+
+    def _begin(self, first: Prepared) -> int | None:
+        """The iteration that the population has reached; None if it is complete."""
+        if run_directory.is_complete(self._run):
+            return None
+        return aligned(self._run, self._display().say, to_stored(first.run))
 
     def _train(self, first: Prepared, until: int | None) -> None:
         train(first, self._display(), None, self._accept, until)
@@ -153,17 +166,6 @@ class Population:
         found[0] |= start_of(self._space, self._start.config)
         return found
 
-    def _aligned(self, first: Prepared) -> int:
-        """Makes the run's config that of its newest checkpoint; returns the iteration of it."""
-        if not (self._run / "config.json").is_file():
-            return 0
-        newest = checkpoint.load_newest(self._run / "checkpoints", self._display().say)
-        settings = newest.manifest if newest else to_stored(first.run)
-        stored = run_directory.read_config(self._run)
-        ours = {name: settings[name] for name in ("config", "arms")}
-        run_directory.write_config(self._run, {**stored, **ours})
-        return int(newest.manifest["iteration"]) if newest else 0
-
     def _exchange(self, iteration: int) -> None:
         """Changes the checkpoint at `iteration` and logs how, unless that was done."""
         newest = checkpoint.load_newest(self._run / "checkpoints", self._display().say)
@@ -172,29 +174,32 @@ class Population:
             return
         run = read_stored(newest.manifest)
         rows = run_directory.rows(self._run)
-        scores = [self._score(rows, number, iteration) for number in range(self._plan.trials)]
-        settings = [settings_in(run, number, self._space) for number in range(len(scores))]
-        draw = np.random.default_rng([self._plan.seeds[0], self._plan.trials, iteration])
-        steps = iteration * self._samples
-        made = exchanges(scores, settings, self._space, draw, iteration, steps)
+        names = [arm_of(number) for number in range(self._plan.trials)]
+        of_arm = [[row for row in rows if row["arm"] == name] for name in names]
+        scores = [self._score(own, iteration) for own in of_arm]
+        settings = [settings_in(run, name, self._space) for name in names]
+        made = self._decided(scores, settings, iteration)
         arrays = dict(newest.arrays)
         for one in made:
             arrays |= copied(newest.arrays, *(self._member(n) for n in (one.source, one.member)))
             run = with_settings(run, arm_of(one.member), one.settings)
         self._log(made, iteration)
-        self._save(newest, arrays, run, run_directory.read_config(self._run))
+        self._save(newest, arrays, run, self._run)
+
+    def _decided(
+        self, scores: Sequence[float], settings: Sequence[Mapping[str, Any]], iteration: int
+    ) -> list[Exchange]:
+        draw = np.random.default_rng([self._plan.seeds[0], self._plan.trials, iteration])
+        steps = iteration * self._samples
+        return exchanges(scores, settings, self._space, draw, iteration, steps)
 
     def _member(self, number: int) -> str:
         return f"{arm_of(number)}/{self._plan.seeds[0]}"
 
-    def _score(self, rows: list[dict[str, Any]], number: int, iteration: int) -> float:
+    def _score(self, rows: list[dict[str, Any]], iteration: int) -> float:
         """Mean return of a member's episodes since the last exchange; NaN without any."""
-        returns = [
-            return_
-            for row in rows
-            if row["arm"] == arm_of(number) and iteration - self._every <= row["iteration"]
-            for return_ in row["episode_returns"]
-        ]
+        recent = [row for row in rows if iteration - self._every <= row["iteration"]]
+        returns = [return_ for row in recent for return_ in row["episode_returns"]]
         return float(np.mean(returns)) if returns else math.nan
 
     def _log(self, made: Sequence[Exchange], iteration: int) -> None:
@@ -209,9 +214,10 @@ class Population:
         newest: checkpoint.Checkpoint,
         arrays: dict[str, np.ndarray],
         run: RunConfig,
-        stored: Mapping[str, Any],
+        path: Path,
     ) -> None:
-        """Puts the changed checkpoint in the place of the one before the exchange."""
+        """Puts the changed checkpoint of the run at `path` in the place of the one before."""
+        stored = run_directory.read_config(path)
         iteration = newest.manifest["iteration"]
         manifest = {name: value for name, value in newest.manifest.items() if name not in FORMER}
         manifest |= {**to_stored(run), DONE: True}
@@ -220,7 +226,7 @@ class Population:
         newest.path.rename(former)
         keep = run.config.keep_checkpoints
         checkpoint.save_checkpoint(newest.path.parent, iteration, arrays, manifest, keep)
-        run_directory.write_config(self._run, {**stored, **to_stored(run)})
+        run_directory.write_config(path, {**stored, **to_stored(run)})
 
     def ended(self) -> list[dict[str, Any]]:
         """Lists the members as JSON values, as `Search.ended` lists trials."""
@@ -228,19 +234,22 @@ class Population:
             return []
         run = read_stored(run_directory.read_config(self._run))
         rows = run_directory.rows(self._run)
-        complete = run_directory.is_complete(self._run)
-        return [
-            self._as_json(run, [row for row in rows if row["arm"] == arm_of(number)], number)
-            | {"state": "complete" if complete else "running"}
-            for number in range(self._plan.trials)
-        ]
+        state = "complete" if run_directory.is_complete(self._run) else "running"
+        found = []
+        for number in range(self._plan.trials):
+            own = [row for row in rows if row["arm"] == arm_of(number)]
+            settings = settings_in(run, arm_of(number), self._space)
+            found.append(self._as_json(number, settings, own) | {"state": state})
+        return found
 
     def importance(self) -> dict[str, float]:
         """Nothing: the settings of a member change."""
         return {}
 
-    def _as_json(self, run: RunConfig, rows: list[dict[str, Any]], number: int) -> dict[str, Any]:
-        settings, steps = settings_in(run, number, self._space), run.config.steps
+    def _as_json(
+        self, number: int, settings: dict[str, Any], rows: list[dict[str, Any]]
+    ) -> dict[str, Any]:
+        steps = self._plan.steps
         curve = [[r["env_steps"] / steps, r["return_mean"]] for r in rows if "return_mean" in r]
         places = np.linspace(0, len(curve) - 1, POINTS if curve else 0).astype(int)
         return {
@@ -320,9 +329,27 @@ def copied(arrays: Mapping[str, np.ndarray], source: str, member: str) -> dict[s
     }
 
 
-def settings_in(run: RunConfig, number: int, space: Space) -> dict[str, Any]:
-    """The searched settings of a member."""
-    values = to_json(run.arms[arm_of(number)])
+def aligned(path: Path, say: Callable[[str], None], before: Mapping[str, Any]) -> int:
+    """Makes a run's config that of its newest checkpoint; returns the iteration of it.
+
+    Args:
+      path: of the run, which may not be there.
+      before: the config without a checkpoint.
+    """
+    if not (path / "config.json").is_file():
+        return 0
+    newest = checkpoint.load_newest(path / "checkpoints", say)
+    settings = newest.manifest if newest else before
+    stored = run_directory.read_config(path)
+    run_directory.write_config(
+        path, {**stored, **{name: settings[name] for name in ("config", "arms")}}
+    )
+    return int(newest.manifest["iteration"]) if newest else 0
+
+
+def settings_in(run: RunConfig, arm: str, space: Space) -> dict[str, Any]:
+    """The searched settings of an arm."""
+    values = to_json(run.arms[arm])
     return {name: as_choice(values[name]) for name in space}
 
 

@@ -87,7 +87,12 @@ def _shown(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def train(overrides: dict[str, Any], elsewhere: dict[str, Any], display: LineDisplay) -> None:
-    """Starts the run, or continues it where it is."""
+    """Starts the run, or continues it where it is.
+
+    With `until` among the overrides, it pauses at the start of that iteration.
+    """
+    overrides = dict(overrides)
+    until = overrides.pop("until", None)
     path, deadline = Path(overrides["out"]), time.monotonic() + PATIENCE
     while True:
         resume = (path / "config.json").exists()
@@ -106,7 +111,7 @@ def train(overrides: dict[str, Any], elsewhere: dict[str, Any], display: LineDis
             time.sleep(0.5)
     if elsewhere:
         _record(run, elsewhere["recorded"], resume)
-    train_run(run, display, resume=resume)
+    train_run(run, display, resume=resume, until=until)
 
 
 def _record(run: runs.Run, recorded: dict[str, Any], resume: bool) -> None:
