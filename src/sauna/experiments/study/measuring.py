@@ -34,18 +34,12 @@ class Item(NamedTuple):
 
     task: str
     label: str
-    arm: str
+    arm: str  # as the members of its run are called
     seed: int
     run: Path
     points: list[float]  # of the measurement's points, those that have a checkpoint of their own
     iterations: list[int]
     files: list[Path]
-
-    @property
-    def member(self) -> str:
-        """Its name in its run."""
-        members = read_stored(run_directory.read_config(self.run)).members
-        return next(member.name for member in members if member.seed == self.seed)
 
     @property
     def is_done(self) -> bool:
@@ -84,6 +78,7 @@ def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator
                 if not part.is_complete(folder):
                     continue
                 run = part.run(folder)
+                called = read_stored(run_directory.read_config(run)).labels[arm.arm]
                 for seed in part.seeds:
                     chosen = checkpoints_at(run, seed, config.steps, measurement.points)
                     name = f"{part.name.replace('/', '_')}_{seed}"
@@ -94,7 +89,7 @@ def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator
                     yield Item(
                         unit.task,
                         arm.label,
-                        arm.arm,
+                        called,
                         seed,
                         run,
                         [*chosen],
@@ -138,7 +133,7 @@ def scale_of(spec: Spec, items: list[Item], task: str) -> dict[str, Any] | None:
     for item in items:
         if (item.task, item.label, item.seed) == (task, spec.baseline, first) and item.iterations:
             last = max(item.iterations)
-            return {"run": str(item.run), "member": item.member, "iteration": last}
+            return {"run": str(item.run), "member": f"{item.arm}/{item.seed}", "iteration": last}
     return None
 
 
@@ -213,7 +208,7 @@ def _start(
     given = {
         "compute": measurement.compute,
         "run": str(item.run),
-        "member": item.member,
+        "member": f"{item.arm}/{item.seed}",
         "iterations": item.iterations,
         "files": [str(file) for file in item.files],
         "scale": scale,
