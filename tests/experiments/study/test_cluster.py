@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,8 +19,10 @@ from clusters import Place, needs_ray, on_ray, same, until
 from helpers import environment
 from sauna import cli
 from sauna.experiments.study.execute import ray_files
+from sauna.experiments.study.execute.ray_cluster import connected
 from sauna.experiments.study.execute.ray_node import Hub
 from sauna.experiments.study.tables import settings
+from sauna.system.errors import SaunaError
 
 STUDY = """
 tasks = ["small_envs:Scripted"]
@@ -79,6 +82,22 @@ def test_an_address_where_nothing_answers(study, address, tmp_path, capsys) -> N
         )
     assert ended.value.code == 2
     assert "sauna: address:" in capsys.readouterr().err
+
+
+def test_a_ray_that_does_not_start_in_time_is_said_in_one_line(monkeypatch) -> None:
+    """Ray raises a bare exception if its parts need too long, as on a busy machine."""
+
+    def init(*given: object, **named: object) -> None:
+        raise Exception("The current node timed out\nduring startup")
+
+    fake = SimpleNamespace(init=init, shutdown=lambda: None)
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "5" * 64)
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    text = "^cannot start Ray: .*timed out during startup; running again continues$"
+    with pytest.raises(SaunaError, match=text), connected("", 1):
+        pass
 
 
 def test_a_report_names_every_machine() -> None:
