@@ -12,9 +12,12 @@ from command_line import sauna_here
 from helpers import SMALL, configured
 from sauna.algorithm.selection.registry import make_filter
 from sauna.config.arms import ARMS, arm_settings, fixed_by
-from sauna.config.presets import resolve
+from sauna.config.presets import resolve, resolve_run
 from sauna.config.settings import Config
+from sauna.config.stored import read_stored, to_stored
 from sauna.envs.spaces import Spaces
+from sauna.experiments.run_list import list_runs
+from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.training.check_plugins import check_plugins
 
@@ -161,6 +164,25 @@ def test_rules_train_by_name_and_by_value(tmp_path) -> None:
     assert [row["policy_loss"] for row in again.metrics] == [
         row["policy_loss"] for row in found.metrics
     ]
+
+
+def test_a_run_of_ones_own_rule_is_called_by_it(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    rule = {"sampler": "own_rules:newest", "control": "random"}
+    settings = {**SMALL, **rule, "arm": "ppo", "steps": 64, "quiet": True}
+    found = sauna.train("small_envs:Scripted", **settings)
+    assert found.path.name.startswith("small_envs-Scripted_ppo+own_rules.newest_seed0_")
+    assert {row["member"] for row in found.metrics} == {"ppo+own_rules.newest/0"}
+    assert "ppo+own_rules.newest" in list_runs(tmp_path)[1]
+    assert sauna.load(found.path, member="ppo+own_rules.newest/0").name == "ppo+own_rules.newest/0"
+    further = sauna.resume(found.path, steps=128, quiet=True)
+    assert {row["member"] for row in further.metrics} == {"ppo+own_rules.newest/0"}
+    sauna.export(found.path, tmp_path / "exported", episodes=0, say=print)
+    assert sauna.load(tmp_path / "exported").name == "ppo+own_rules.newest/0"
+    stored = run_directory.read_config(found.path)
+    before = {name: value for name, value in stored.items() if name != "names_rules"}
+    assert [member.name for member in read_stored(before).members] == ["ppo/0"], "a run of before"
+    assert "names_rules" not in to_stored(resolve_run({"env": "x", "arm": "gigaflow"}))
 
 
 def test_everything_a_rule_is_written_with_is_public() -> None:

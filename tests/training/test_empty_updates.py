@@ -43,7 +43,8 @@ def test_a_run_that_learns_nothing_fails(tmp_path, capsys) -> None:
             out=tmp_path / "r",
             **settings,
         )
-    assert "warning: sauna/0: the rule kept no sample of iteration 0" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "warning: sauna+own_rules.nothing/0: the rule kept no sample of iteration 0" in said
 
 
 def test_a_minibatch_of_one_sample_is_refused() -> None:

@@ -15,6 +15,7 @@ from sauna.system.errors import BadInput, nearest, one_line
 
 LOCAL = local.__name__
 STORED_BEFORE = "sauna.local"  # its name in the runs of 0.1.0
+RULES = ("filter", "sampler", "loss_weight", "objective", "stop", "critic")  # fields of rules
 _UNIQUE = re.compile(r"_[0-9a-f]{16}$")  # ends a part's name; older runs have names that may meet
 
 
@@ -105,6 +106,14 @@ def name_of(thing: Any) -> str:
     name = f"{name}_{uuid.uuid4().hex[:16]}"
     setattr(local, name, thing)
     return f"{LOCAL}:{name}"
+
+
+def label_of(arm: str, settings: Mapping[str, Any]) -> str:
+    """Names an arm by the user's own rules as well: `ppo+my_module.rule`, fit for a folder."""
+    named = [str(settings[field]) for field in RULES if ":" in str(settings.get(field, ""))]
+    short = [_UNIQUE.sub("", name.partition(":")[2]) if is_local(name) else name for name in named]
+    first, plus, others = arm.partition("+")
+    return "+".join([first, *(re.sub(r"[^\w.-]", ".", name) for name in short)]) + plus + others
 
 
 def is_held(path: str) -> bool:

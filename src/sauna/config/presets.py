@@ -22,6 +22,7 @@ from sauna.config.arms import RULE_HELP as RULE_HELP
 from sauna.config.checks import check_consistent, check_read, is_read
 from sauna.config.choices import BOUNDED
 from sauna.config.other_names import key_hint
+from sauna.config.plugins import label_of
 from sauna.config.settings import FIELDS, Config, fields_with, parse
 from sauna.config.task_presets import TASK_PRESET_HELP, TASK_PRESETS
 from sauna.config.zoo import AUTO, MUJOCO, entry_for
@@ -140,24 +141,34 @@ class RunConfig(NamedTuple):
     Attributes:
       config: what the program of all members is compiled from.
       arms: each arm's config, which differs from it in values that are traced.
+      names_rules: whether members are called by a rule of the user's own, too. Those of runs from
+        before are called by the arm alone.
     """
 
     config: Config
     arms: dict[str, Config]
+    names_rules: bool = False
 
     @property
     def members(self) -> list[Member]:
         """Lists all members, arm by arm and seed by seed; each with its own arm's config."""
         return [
-            Member(f"{arm}/{seed}", arm, seed, self.arms[arm])
-            for arm in self.config.arm
+            Member(f"{label}/{seed}", label, seed, self.arms[arm])
+            for arm, label in self.labels.items()
             for seed in self.config.seeds
         ]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Names each arm as its members are: `ppo+my_module.rule` if the rule is the user's own."""
+        if not self.names_rules:
+            return {arm: arm for arm in self.config.arm}
+        return {arm: label_of(arm, vars(self.arms[arm])) for arm in self.config.arm}
 
     def replace(self, **changes: Any) -> RunConfig:
         """Changes settings of the program and of all arms."""
         arms = {arm: dataclasses.replace(own, **changes) for arm, own in self.arms.items()}
-        return RunConfig(dataclasses.replace(self.config, **changes), arms)
+        return RunConfig(dataclasses.replace(self.config, **changes), arms, self.names_rules)
 
 
 def resolve(overrides: Mapping[str, Any]) -> Config:
@@ -182,7 +193,8 @@ def resolve_run(overrides: Mapping[str, Any]) -> RunConfig:
     for arm, config in configs.items():
         _check_same_program(arm, config, shared)
     check_consistent(shared)
-    return RunConfig(shared, {arm: _member_config(own, shared) for arm, own in configs.items()})
+    own = {arm: _member_config(config, shared) for arm, config in configs.items()}
+    return RunConfig(shared, own, any(arm != label_of(arm, vars(c)) for arm, c in own.items()))
 
 
 def parse_all(overrides: Mapping[str, Any]) -> dict[str, Any]:

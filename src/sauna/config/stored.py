@@ -11,15 +11,20 @@ from sauna.config.settings import Config, to_json
 from sauna.system.errors import BadInput
 from sauna.system.migrations import with_arms, without_removed
 
+NAMES_RULES = "names_rules"
+
 
 def to_stored(run: RunConfig) -> dict[str, Any]:
-    """Writes `config`, and in `arms` the values in which each arm differs from it."""
+    """Writes `config`, and in `arms` the values in which each arm differs from it.
+
+    If members are called by a rule of the user's own, that is noted.
+    """
     shared = to_json(run.config)
     arms = {
         arm: {name: value for name, value in to_json(config).items() if value != shared[name]}
         for arm, config in run.arms.items()
     }
-    return {"config": shared, "arms": arms}
+    return {"config": shared, "arms": arms, **({NAMES_RULES: True} if run.names_rules else {})}
 
 
 def read_stored(stored: Mapping[str, Any]) -> RunConfig:
@@ -41,7 +46,7 @@ def read_stored(stored: Mapping[str, Any]) -> RunConfig:
         arm: dataclasses.replace(config, **parse_all(without_removed(arms[arm])))
         for arm in config.arm
     }
-    return RunConfig(config, own)
+    return RunConfig(config, own, stored.get(NAMES_RULES) is True)
 
 
 def stored_config(stored: Mapping[str, Any]) -> Config:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sauna.config.plugins import label_of
 from sauna.experiments.report.numbers import aligned, digits_of, number
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError, printable
@@ -76,20 +77,24 @@ def examine(run: Path) -> Listed:
     """What the files of a run say of it."""
     changed = max(_time_of(run / name) for name in ("config.json", "metrics.jsonl", "failure.txt"))
     try:
-        config = run_directory.read_config(run, needed=("config",))["config"]
-        arms, seeds = tuple(map(str, config["arm"])), len(config["seeds"])
+        stored = run_directory.read_config(run, needed=("config",))
+        config, own = stored["config"], stored.get("arms", {})
+        labels = {
+            arm: label_of(arm, {**config, **own.get(arm, {})}) for arm in map(str, config["arm"])
+        }
+        seeds = len(config["seeds"])
         budget = f"{config.get('budget', 'env')}_steps"
-        last = last_rows(run / "metrics.jsonl", len(arms) * seeds)
+        last = last_rows(run / "metrics.jsonl", len(labels) * seeds)
         used = [row.get(budget, 0) for row in last.values()]
         return Listed(
             run,
             _state(run),
             str(config["env"]),
-            arms,
+            tuple(labels.values()),
             seeds,
-            sum(used) / (len(arms) * seeds),
+            sum(used) / (len(labels) * seeds),
             int(config["steps"]),
-            _returns(arms, last),
+            _returns(labels, last),
             changed,
         )
     except (SaunaError, OSError) as error:
@@ -127,12 +132,12 @@ def _latest(lines: list[bytes]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _returns(arms: tuple[str, ...], last: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+def _returns(labels: Mapping[str, str], last: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     found = {}
-    for arm in arms:
-        values = [r["return_mean"] for r in last.values() if r["arm"] == arm and "return_mean" in r]
-        if values:
-            found[arm] = math.fsum(values) / len(values)
+    for names in labels.items():  # rows of before hold the arm
+        rows = [row for row in last.values() if row["arm"] in names and "return_mean" in row]
+        if rows:
+            found[names[1]] = math.fsum(row["return_mean"] for row in rows) / len(rows)
     return found
 
 

@@ -366,9 +366,10 @@ def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str,
 
 def headline(config: Config, members: list[Member], path: Path) -> str:
     """Says in one line what is trained, and where it is written."""
+    arms = ", ".join(dict.fromkeys(member.arm for member in members))
     return (
         f"{config.env}: {counted(len(members), 'member')} "
-        f"({', '.join(config.arm)} x {counted(len(config.seeds), 'seed')}), {config.steps:,} "
+        f"({arms} x {counted(len(config.seeds), 'seed')}), {config.steps:,} "
         f"{'env' if config.budget == 'env' else 'kept'} steps each, preset {config.preset}, "
         f"{config.processes} process{'es' if config.processes > 1 else ''}; writing to {path}"
     )

@@ -17,7 +17,7 @@ from sauna.config.code import changed_code, code_of
 from sauna.config.imported_from import KEY, folders_of, names_the_folder
 from sauna.config.own_sources import newer_sources
 from sauna.config.parsing import many_seeds
-from sauna.config.presets import Member, parse_all, plain, resolve_run
+from sauna.config.presets import Member, RunConfig, parse_all, plain, resolve_run
 from sauna.config.settings import Config, fields_with
 from sauna.config.stored import read_stored, to_stored
 from sauna.config.trust import check_trusted, seal
@@ -135,7 +135,7 @@ def create(
     Raises:
       BadInput: the directory holds something already, or cannot be made.
     """
-    path, made = _make_directory(prepared.config)
+    path, made = _make_directory(prepared.run)
     prepared = prepared._replace(run=prepared.run.replace(out=str(path)))
     path = Path.cwd() / path
     stored = {
@@ -164,14 +164,16 @@ def create(
     return run
 
 
-def _make_directory(config: Config) -> tuple[Path, bool]:
+def _make_directory(run: RunConfig) -> tuple[Path, bool]:
     """Makes the run's directory; returns it and whether it is new.
 
     Raises:
       BadInput: it holds something already, or cannot be made.
     """
+    config = run.config
     if not config.out:
-        return run_directory.create_default(config.env, config.arm, config.seeds), True
+        labels = tuple(run.labels.values())
+        return run_directory.create_default(config.env, labels, config.seeds), True
     path = Path(config.out)
     made = not path.exists()
     with disk_errors(path):

@@ -275,7 +275,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def found(run: Path) -> Inspection:
     settings = {"episodes": 3, "deterministic": False, "seed": 3, "frames": False}
-    return examine(run, load_artifact(run), "sauna+top-advantage/0", **settings, say=print)
+    name = "sauna+own_rules.likely+top-advantage/0"
+    return examine(run, load_artifact(run), name, **settings, say=print)
 
 
 def test_a_filter_of_ones_own_sees_actions_values_and_log_probabilities(

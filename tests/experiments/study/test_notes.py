@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import json
+
 import numpy as np
 import pytest
 
@@ -10,6 +13,7 @@ from sauna.config.presets import resolve
 from sauna.experiments.statistics import compare, least_seeds
 from sauna.experiments.study.cells import Cell
 from sauna.experiments.study.command import comparison
+from sauna.experiments.study.execute.unit_process import LineDisplay
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.spec import Spec
 from sauna.experiments.study.verdicts import least_of
@@ -81,3 +85,12 @@ def test_leftover_steps_are_named_from_a_twentieth_of_the_budget(steps: int, tex
     note = budget_note(resolve({"env": "x", "steps": steps}))
     assert text in note if text else note == ""
     assert budget_note(resolve({"env": "x", "steps": steps, "arm": "sauna"})) == ""
+
+
+def test_a_unit_repeats_no_note_of_its_study() -> None:
+    out = io.StringIO()
+    LineDisplay(out).say("note: as the study said")
+    LineDisplay(out).say("warning: of this run")
+    assert [json.loads(line) for line in out.getvalue().splitlines()] == [
+        {"said": "warning: of this run"}
+    ]

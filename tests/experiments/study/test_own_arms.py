@@ -15,6 +15,7 @@ from sauna.experiments.study.command import (
 from sauna.experiments.study.own_arms import stage_of
 from sauna.experiments.study.rounds import controls_of
 from sauna.experiments.study.spec import Spec, check
+from sauna.experiments.study.units import units_of
 from sauna.experiments.study.verdicts import is_random_control
 from sauna.system.errors import BadInput
 
@@ -96,6 +97,18 @@ def test_what_is_no_rule_is_no_arm(name: str) -> None:
         return
     with pytest.raises(BadInput, match="is no Sampler, StepFilter"):
         stage_of(name, {})
+
+
+def test_units_are_called_by_the_rule_without_what_folders_cannot_hold() -> None:
+    arms = ("ppo", NEWEST, f"{NEWEST}+random", LIKELY)
+    spec = comparison("Hopper-v5", arms, {"seeds": (0, 1)})
+    names = [unit.name.rsplit("_", 2)[0] for unit in units_of(spec, 2)]
+    assert names == [
+        "Hopper-v5_ppo",
+        "Hopper-v5_ppo+own_rules.newest",
+        "Hopper-v5_ppo+own_rules.newest+random",
+        "Hopper-v5_sauna+own_rules.likely",
+    ]
 
 
 def test_the_command_of_a_study_that_names_code_says_trust() -> None:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.config.stored import read_stored
 from sauna.experiments.curves import area_under_curve
 from sauna.experiments.measure.measurement import Measurement
 from sauna.experiments.study.execute.process import Message, UnitProcess
@@ -33,7 +34,7 @@ class Item(NamedTuple):
 
     task: str
     label: str
-    arm: str
+    arm: str  # as the members of its run are called
     seed: int
     run: Path
     points: list[float]  # of the measurement's points, those that have a checkpoint of their own
@@ -77,6 +78,7 @@ def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator
                 if not part.is_complete(folder):
                     continue
                 run = part.run(folder)
+                called = read_stored(run_directory.read_config(run)).labels[arm.arm]
                 for seed in part.seeds:
                     chosen = checkpoints_at(run, seed, config.steps, measurement.points)
                     name = f"{part.name.replace('/', '_')}_{seed}"
@@ -87,7 +89,7 @@ def _items(spec: Spec, units: list[Unit], folder: Path, place: Path) -> Iterator
                     yield Item(
                         unit.task,
                         arm.label,
-                        arm.arm,
+                        called,
                         seed,
                         run,
                         [*chosen],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sauna.config.checks import budget_note
+from sauna.config.checks import budget_note, cautions
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import chosen_preset
 from sauna.config.settings import Config, flag, to_json
@@ -32,7 +32,7 @@ def before_training(spec: Spec, seeds: str = "seeds") -> list[str]:
 def _of_config(arm: Arm, task: str) -> list[str]:
     """Says which preset stands where none is named, and how far a small budget reaches."""
     config = check(arm, task)
-    notes = [budget_note(config)]
+    notes = [budget_note(config), *(text for text in cautions(config) if text.startswith("note:"))]
     if "preset" not in arm.settings:
         notes.append(_unnamed(chosen_preset(arm.settings), config, task, "steps" in arm.settings))
     return [note for note in notes if note]

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sauna.config.plugins import label_of
 from sauna.config.presets import BEFORE
 from sauna.config.settings import Config, to_json
 from sauna.experiments.study.spec import Arm, Spec, check
@@ -88,7 +89,8 @@ def _parts(arm: Arm, size: int) -> Iterator[tuple[int, ...]]:
 def _unit(arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
     digest = digest_of([RULES, identity(arm, task, seeds), None])  # None: as units were named
     place = "".join(c if c.isalnum() or c in "-." else "-" for c in task)
-    name = f"{place}_{arm.arm}_{seeds[0]}-{seeds[-1]}_{digest}"
+    label = label_of(arm.arm, arm.settings)
+    name = f"{place}_{label}_{seeds[0]}-{seeds[-1]}_{digest}"
     return Unit(name, task, arm.label, seeds, arm.overrides(task, seeds))
 
 
