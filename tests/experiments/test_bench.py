@@ -10,8 +10,10 @@ import pytest
 from sauna import cli
 from sauna.config.presets import resolve
 from sauna.experiments.bench import command, scale
+from sauna.experiments.bench.peer_settings import peer_settings
 from sauna.experiments.bench.rates import Clock, alternate, physics_rate, ratio, simulator
 from sauna.experiments.bench.split import SECTIONS, Timers, split
+from sauna.system.errors import BadInput
 
 
 def test_the_rate_leaves_out_the_warm_up() -> None:
@@ -105,11 +107,11 @@ def test_the_report_shows_every_figure() -> None:
     "arguments, message",
     [
         (["--against", "sb4"], "unknown peer 'sb4'"),
-        (["--against", "sb3", "--epochs", "1"], "epochs: not read by sb3"),
-        (["--against", "sb3", "--env-kwargs", '{"a": 1}'], "env_kwargs: not read by sb3"),
-        (["--against", "sb3", "--preset", "mujoco-release"], "settings of mujoco, not of mujoco-r"),
-        (["--against", "sb3", "--algorithm", "a2c"], "settings of a2c-mujoco, not of a2c"),
-        (["ALE/Pong-v5", "--against", "sb3"], "settings of atari, not of mujoco"),
+        (["--against", "sb3", "--warmup", "0.1"], "warmup: not read by sb3, which has 0.0"),
+        (["--against", "sb3", "--recurrent", "lstm"], "recurrent: not read by sb3"),
+        (["--against", "sb3", "--distribution", "beta"], "distribution: sb3 has no beta"),
+        (["--against", "sb3", "--preset", "a2c"], "trunk: not read by sb3, which has separate"),
+        (["ALE/Pong-v5", "--against", "sb3"], "trunk: not read by sb3, which has shared"),
         (["ALE/Pong-v5", "--against", "sb3", "--preset", "a2c-atari"], "sb3 is run with PPO"),
         (["--rounds", "0"], "rounds: must be"),
         (["NoSuch-v0"], "unknown environment"),
@@ -132,6 +134,20 @@ def test_bad_input(arguments: list[str], message: str, tmp_path, monkeypatch, ca
     assert exit.value.code == 2
     assert message in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_peer_gets_the_settings_of_the_run() -> None:
+    config = resolve({"env": "CartPole-v1", "arm": "ppo", "preset": "cartpole", "hidden": "32"})
+    found = peer_settings("sb3", config)
+    assert (found["envs"], found["rollout_steps"], found["minibatches"]) == (8, 32, 1)
+    assert (found["hidden"], found["clip_range_schedule"]) == ((32,), "linear")
+    assert json.loads(json.dumps(found))["normalize_observations"] is False
+
+
+def test_a_script_with_numbers_of_its_own_gets_the_environment_alone() -> None:
+    assert peer_settings("cleanrl", resolve({"env": "Hopper-v5"})) == {"env": "Hopper-v5"}
+    with pytest.raises(BadInput, match="envs: not read by cleanrl, which has 1"):
+        peer_settings("cleanrl", resolve({"env": "Hopper-v5", "envs": 4}))
 
 
 @pytest.mark.slow

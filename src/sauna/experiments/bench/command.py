@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sauna.config.presets import arm_config, plain, resolve
-from sauna.config.settings import FIELDS, Config
+from sauna.config.presets import plain, resolve
+from sauna.experiments.bench.peer_settings import peer_settings
 from sauna.experiments.bench.peers import peer_rate, prepare, versions
 from sauna.experiments.bench.rates import (
     WARM_UP,
@@ -26,15 +26,8 @@ from sauna.experiments.bench.rates import (
 )
 from sauna.experiments.bench.scale import scale
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
 
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
-# The settings of environment and learning, which a trainer without filters has as well.
-_LEARNING = tuple(
-    name
-    for name, field in FIELDS.items()
-    if field.metadata["group"] in ("task", "learning", "network", "normalisation") and name != "env"
-)
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 
 
@@ -82,12 +75,17 @@ def bench(
         "git": run_directory.git_revision(),
     }
     if against:
-        _check_peer(config, overrides, against)
+        settings = peer_settings(against, config)
         python = prepare(against, say)
         measures[against] = partial(
-            peer_rate, python, script, config.env, config.algorithm, processes, SECONDS
+            peer_rate, against, python, script, settings, processes, SECONDS
         )
-        result["peer"] = {"name": against, "processes": processes, "versions": versions(python)}
+        result["peer"] = {
+            "name": against,
+            "processes": processes,
+            "versions": versions(python),
+            "settings": settings,
+        }
     result["rates"] = rates = alternate(measures, rounds, say)
     result["ratios"] = {
         name: ratio(rates["training"], others)
@@ -99,29 +97,6 @@ def bench(
     result["split"] = _split_elsewhere({**overrides, "steps": batch * 100}, share)
     result |= start_and_memory(overrides)
     return result
-
-
-def _check_peer(config: Config, overrides: Mapping[str, Any], against: str) -> None:
-    """Refuses settings of learning that a peer, which has those of one preset, would not read.
-
-    Arms and filters are not among them: what they cost beside a peer's PPO is a fair question.
-
-    Raises:
-      BadInput: naming the field.
-    """
-    atari = config.env.startswith("ALE/")
-    if config.algorithm != "ppo" and (against != "sb3" or atari):
-        raise BadInput(f"against: {against} is run with PPO, not with {config.algorithm}")
-    preset = "atari" if atari else "mujoco" if config.algorithm == "ppo" else "a2c-mujoco"
-    if config.preset != preset:
-        raise BadInput(
-            f"preset: {against} runs {config.env} with the settings of {preset}, not of "
-            f"{config.preset}"
-        )
-    usual = arm_config("ppo", {"preset": preset})
-    for name in (name for name in overrides if name in _LEARNING):
-        if getattr(config, name) != getattr(usual, name):
-            raise BadInput(f"{name}: not read by {against}, which runs the preset {preset}")
 
 
 def bench_scale(

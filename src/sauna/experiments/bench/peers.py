@@ -13,16 +13,22 @@ import sys
 import tempfile
 import time
 import venv
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from sauna.system.errors import BadInput, SaunaError
 
 # What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy.
 PEERS = {
-    "sb3": ["stable-baselines3==2.9.2", "gymnasium[mujoco]", "ale-py", "opencv-python-headless"],
+    "sb3": [
+        "stable-baselines3==2.9.2",
+        "gymnasium[mujoco,box2d]",
+        "ale-py",
+        "opencv-python-headless",
+    ],
     "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
 }
 # CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
@@ -74,21 +80,26 @@ def _pip(python: Path, arguments: list[str]) -> str | None:
 
 
 def peer_rate(
-    python: Path, script: Path | None, env: str, algorithm: str, processes: int, seconds: float
+    peer: str,
+    python: Path,
+    script: Path | None,
+    settings: Mapping[str, Any],
+    processes: int,
+    seconds: float,
 ) -> float:
     """Returns env steps per second, summed over `processes` trainings that run at the same time.
 
     Args:
-      script: CleanRL's `ppo_continuous_action.py`, or None for Stable-Baselines3.
-      algorithm: of Stable-Baselines3.
+      script: CleanRL's `ppo_continuous_action.py`; None for another peer.
+      settings: what `peer_settings` gives.
 
     Raises:
       SaunaError: one of them failed; its last line says why.
     """
-    measure = partial(_sb3, algorithm) if script is None else partial(_cleanrl, script)
+    measure = partial(_own, peer) if script is None else partial(_cleanrl, script)
     with ThreadPoolExecutor(processes) as pool:
-        rates = pool.map(lambda seed: measure(python, env, seed, seconds), range(processes))
-        return sum(rates)
+        each = ({**settings, "seed": seed, "seconds": seconds} for seed in range(processes))
+        return sum(pool.map(lambda one: measure(python, one), each))
 
 
 def _variables() -> dict[str, str]:
@@ -97,9 +108,10 @@ def _variables() -> dict[str, str]:
     return variables
 
 
-def _sb3(algorithm: str, python: Path, env: str, seed: int, seconds: float) -> float:
-    script = Path(__file__).with_name("peer_sb3.py")
-    command = [str(python), str(script), env, str(seed), str(seconds), algorithm]
+def _own(peer: str, python: Path, settings: Mapping[str, Any]) -> float:
+    """The rate that `peer_NAME.py` prints as JSON on its last line."""
+    script = Path(__file__).with_name(f"peer_{peer}.py")
+    command = [str(python), str(script), json.dumps({**settings, "folder": os.getcwd()})]
     with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it is started
         done = subprocess.run(command, capture_output=True, text=True, env=_variables(), cwd=folder)
     if done.returncode:
@@ -107,9 +119,10 @@ def _sb3(algorithm: str, python: Path, env: str, seed: int, seconds: float) -> f
     return float(json.loads(done.stdout.splitlines()[-1])["rate"])
 
 
-def _cleanrl(script: Path, python: Path, env: str, seed: int, seconds: float) -> float:
+def _cleanrl(script: Path, python: Path, settings: Mapping[str, Any]) -> float:
     """The script prints a line after each update; the first two are not counted."""
-    command = [str(python), "-u", str(script.resolve()), "--env-id", env, "--seed", str(seed)]
+    arguments = ["--env-id", settings["env"], "--seed", str(settings["seed"])]
+    command = [str(python), "-u", str(script.resolve()), *arguments]
     seen: list[float] = []
     last = ""
     with tempfile.TemporaryDirectory() as folder:
@@ -126,7 +139,7 @@ def _cleanrl(script: Path, python: Path, env: str, seed: int, seconds: float) ->
             last = line
             if line.startswith("SPS:"):
                 seen.append(time.perf_counter())
-                if len(seen) >= 5 and seen[-1] - seen[2] > seconds:
+                if len(seen) >= 5 and seen[-1] - seen[2] > settings["seconds"]:
                     break
         process.kill()
         process.wait()

@@ -1,0 +1,89 @@
+"""Which of our settings each peer reads, so that both train with the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sauna.config.settings import FIELDS, Config
+from sauna.system.errors import BadInput
+
+_ANY = None
+_PPO: Mapping[str, Any] = dict.fromkeys(
+    (
+        "env",
+        "env_kwargs",
+        "envs",
+        "rollout_steps",
+        "minibatches",
+        "epochs",
+        "learning_rate",
+        "max_grad_norm",
+        "clip_range",
+        "clip_value",
+        "normalize_advantages",
+        "entropy_coef",
+        "value_coef",
+        "gamma",
+        "gae_lambda",
+        "hidden",
+        "value_hidden",
+        "normalize_observations",
+        "normalize_rewards",
+        "clip_observations",
+        "clip_rewards",
+        "log_std_init",
+        "sde_sample_freq",
+        "sde_expln",
+    ),
+    _ANY,
+)
+# Of each peer, the settings of learning that it reads, with the values that it knows. CleanRL's
+# script has numbers of its own: those of preset mujoco, which are our defaults.
+READ: dict[str, Mapping[str, Any]] = {
+    "sb3": {
+        **_PPO,
+        "algorithm": ("ppo", "a2c"),
+        "learning_rate_schedule": ("constant", "linear"),
+        "clip_range_schedule": ("constant", "linear"),
+        "activation": ("tanh", "relu", "elu", "gelu", "selu", "sigmoid", "silu"),
+        "distribution": ("gaussian", "gsde"),
+    },
+    "cleanrl": {"env": _ANY},
+}
+_LEARNING = ("task", "learning", "network", "normalisation")
+_COSTLESS = ("rescale_actions",)  # a multiplication of each action, or none
+# What a preset may differ in from the defaults, and what of it a peer does by itself.
+_ALONE: dict[str, dict[str, Any]] = {
+    "a2c": {"optimizer": "rmsprop", "trunk": "separate"},
+    "atari": {"trunk": "shared", "sign_rewards": True},
+}
+
+
+def peer_settings(peer: str, config: Config) -> dict[str, Any]:
+    """Picks what a peer is given of a run's settings.
+
+    Arms and filters are not among them: what they cost beside a peer's PPO is a fair question.
+
+    Raises:
+      BadInput: the run has a setting of learning that the peer does not read, or not with this
+        value; the field is named.
+    """
+    if peer not in READ:
+        raise BadInput(f"against: unknown peer {peer!r} (known: {', '.join(READ)})")
+    read = READ[peer]
+    atari = config.env.startswith("ALE/")
+    if config.algorithm not in read.get("algorithm", ("ppo",)) or (
+        atari and config.algorithm != "ppo"
+    ):
+        raise BadInput(f"against: {peer} is run with PPO, not with {config.algorithm}")
+    alone = {**_ALONE.get(config.algorithm, {}), **(_ALONE["atari"] if atari else {})}
+    for name, known in read.items():
+        if known is not _ANY and getattr(config, name) not in known:
+            raise BadInput(f"{name}: {peer} has no {getattr(config, name)}")
+    for name, field in FIELDS.items():
+        usual = alone.get(name, field.default)
+        unread = field.metadata["group"] in _LEARNING and name not in (*read, *_COSTLESS)
+        if unread and getattr(config, name) != usual:
+            raise BadInput(f"{name}: not read by {peer}, which has {usual}")
+    return {name: getattr(config, name) for name in read}
