@@ -14,7 +14,7 @@ from helpers import configured, equal, make_job, resumed, train_here
 from sauna.algorithm.learner.program import make_learner, make_parts
 from sauna.algorithm.learner.selected import drawn_length
 from sauna.algorithm.learner.update import device_minibatch_order
-from sauna.algorithm.policy.policy import make_policy
+from sauna.algorithm.policy.policy import make_policy, score
 from sauna.algorithm.selection.control import controlled_filter
 from sauna.algorithm.types import Hypers, member_keys, selection_key
 from sauna.config.presets import ARMS
@@ -126,6 +126,8 @@ def test_the_device_learns_what_the_host_learns(arm: str) -> None:
         random_rollout(2, 16, 2),
     )
     keys = member_keys(0)
+    scores = score(policy, learner.init(keys.init).params, rollout.observation, rollout.action)
+    rollout = rollout._replace(log_prob=scores[..., 0])  # a rule that stops sees ratios of 1 first
     values = {name: jnp.float32(getattr(config, name)) for name in Hypers._fields}
     h, iteration = Hypers(**values), jnp.int32(3)
     setting = Setting(keys, h, jnp.int32(128))
