@@ -1,7 +1,8 @@
 """Makes the tables of speed and the figure of scale from `benchmarks/results/`.
 
-python benchmarks/make.py            tables and figure from the result files
-python benchmarks/make.py --measure  measures first (about half an hour on an idle machine)
+python benchmarks/make.py                      tables and figure from the result files
+python benchmarks/make.py --measure            measures first (about an hour on an idle machine)
+python benchmarks/make.py --measure NAME ...   measures these result files alone
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,17 @@ MEASURED = {
         "10",
     ],
 }
+# Environments written in Python, and wide networks: one seed per core.
+OTHERS = {
+    "cartpole": ["CartPole-v1", "--preset", "auto", "--iterations", "400"],
+    "lunar_lander": ["LunarLander-v3", "--preset", "auto", "--iterations", "8"],
+    "bipedal_walker": ["BipedalWalker-v3", "--preset", "auto", "--iterations", "2"],
+    "own_dict": ["own_envs:Reach"],
+    "own_slow": ["own_envs:Reach", "--env-kwargs", '{"milliseconds": 1}', "--iterations", "3"],
+    "cheetah_256": ["HalfCheetah-v5", "--hidden", "256,256", "--iterations", "12"],
+    "cheetah_512": ["HalfCheetah-v5", "--hidden", "512,256,128", "--iterations", "6"],
+}
+_BESIDE = ["--seeds", "2", "--against", "sb3", "--rounds", "5"]
 # Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
 BY_HAND = ["cheetah_1_cleanrl"]
@@ -48,13 +61,20 @@ FILTERED = {
 }
 
 
-def measure() -> None:
-    for name, flags in MEASURED.items():
+def measure(names: Sequence[str]) -> None:
+    """Measures what is named, or all; from the folder in which `own_envs.py` is found."""
+    flags = {
+        **MEASURED,
+        **{name: [*own, *_BESIDE] for name, own in OTHERS.items()},
+        "scale": ["--scale"],
+    }
+    for name in names or (*flags, "filtered"):
+        if name == "filtered":
+            measure_filtered()
+            continue
+        command = [sys.executable, "-m", "sauna", "bench", *flags[name]]
         file = str(RESULTS / f"{name}.json")
-        subprocess.run([sys.executable, "-m", "sauna", "bench", *flags, "--json", file], check=True)
-    measure_filtered()
-    file = str(RESULTS / "scale.json")
-    subprocess.run([sys.executable, "-m", "sauna", "bench", "--scale", "--json", file], check=True)
+        subprocess.run([*command, "--json", file], check=True, cwd=ROOT / "benchmarks")
 
 
 def measure_filtered() -> None:
@@ -83,12 +103,31 @@ def filtered_table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def stored() -> dict[str, dict[str, Any]]:
+def stored(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     return {
         name: json.loads(path.read_text())
-        for name in [*MEASURED, *BY_HAND]
+        for name in names
         if (path := RESULTS / f"{name}.json").exists()
     }
+
+
+def others_table(found: dict[str, dict[str, Any]]) -> str:
+    """Beside another trainer with the same settings, and what the environment takes of our time."""
+    lines = [
+        "| PPO on | envs x steps, epochs, network | env steps/s, in sum | of another trainer | the environment's share of our time |",  # noqa: E501
+        "|---|---|---|---|---|",
+    ]
+    for one in found.values():
+        rates, own = sorted(one["rates"]["training"]), one["peer"]["settings"]
+        env = one["env"] + (", 1 ms a step" if "milliseconds" in own["env_kwargs"] else "")
+        network = "-".join(map(str, own["hidden"]))
+        stepping = one["split"]["environment"] + one["split"]["physics"]
+        lines.append(
+            f"| {env} | {own['envs']} x {own['rollout_steps']}, {own['epochs']}, {network} | "
+            f"{rates[len(rates) // 2]:,.0f} | {_peer(one)} | "
+            f"{stepping / sum(one['split'].values()):.0%} |"
+        )
+    return "\n".join(lines)
 
 
 def rates_table(found: dict[str, dict[str, Any]]) -> str:
@@ -195,14 +234,15 @@ def insert(path: Path, name: str, text: str) -> None:
 def main() -> None:
     os.chdir(ROOT)
     if "--measure" in sys.argv:
-        measure()
-    found = stored()
+        measure(sys.argv[sys.argv.index("--measure") + 1 :])
+    found = stored([*MEASURED, *BY_HAND])
     insert(ROOT / "README.md", "speed", short_table(found))
     page = ROOT / "docs" / "concepts" / "performance.md"
     machine = next(iter(found.values()))["machine"]
     text = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
     insert(page, "machine", f"Measured on: {text}.")
     insert(page, "rates", rates_table(found))
+    insert(page, "others", others_table(stored(OTHERS)))
     insert(page, "split", split_table(found))
     filtered = RESULTS / "filtered.json"
     if filtered.exists():

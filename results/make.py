@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from clone_page import clone_text
 from measured_pages import fine_tuning_page, noise_page, posture_page, sweep_page
+from pictures import store
 from selection_page import CURVES as SELECTION_CURVES
 from selection_page import POINTS as SELECTION_POINTS
 from selection_page import SELECTION, selection_page
@@ -182,7 +183,7 @@ def collect_measured(name: str) -> None:
         (ROOT / "results" / f"{name}.json").write_text(text)
     if (place / "figures" / "frames.png").exists():
         STILLS.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(place / "figures" / "frames.png", STILLS)
+        store(place / "figures" / "frames.png", STILLS)
 
 
 def insert(path: Path, name: str, text: str) -> None:
@@ -206,7 +207,7 @@ def measured_figures(name: str, measured: Mapping[str, Any]) -> None:
     plots = [plot for plot in extra.plots if plot.name in SHOWN_PLOTS]
     with tempfile.TemporaryDirectory() as folder:
         for path in draw_plots(plots, extra.looks, Path(folder)).values():
-            shutil.copy(path.with_suffix(".png"), FIGURES / f"{path.stem}.png")
+            store(path.with_suffix(".png"), FIGURES / f"{path.stem}.png")
 
 
 def readmes_picture(results: dict[str, Any]) -> None:
@@ -215,7 +216,7 @@ def readmes_picture(results: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         write_figures(shown, summarize(shown), Path(folder))
         picture = Path(folder) / "figures" / f"{CURVES_OF_RETURNS}.png"
-        shutil.copy(picture, ROOT / "docs" / "images" / picture.name)
+        store(picture, ROOT / "docs" / "images" / picture.name)
 
 
 def write_pages() -> None:

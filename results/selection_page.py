@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -43,9 +43,9 @@ def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
         return "The screen has not been trained yet."
     summaries = [(results, summarize(results)) for results in studies]
     cells = {
-        (label, task): text
+        (label, task): cell.shown
         for results, summary in summaries
-        for (label, task), text in words_of(results, summary).items()
+        for (label, task), cell in words_of(results, summary).items()
     }
     tasks = list(dict.fromkeys(task for _, task in cells))
     labels = list(dict.fromkeys(label for label, _ in cells))
@@ -64,7 +64,14 @@ def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def words_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[tuple[str, str], str]:
+class Cell(NamedTuple):
+    """A rule on a task: the word at equal env steps, and all that the table shows."""
+
+    word: str
+    shown: str
+
+
+def words_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
     """Says for each arm and task whether it beats the baseline, at equal steps and compute.
 
     Arms of which no seed has ended are left out.
@@ -83,8 +90,32 @@ def words_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[tup
         if row["label"] == base or not row["seeds"] or row["improvement"] is None:
             continue
         word = word_of(row["improvement"], scores[key], scores[base, row["task"]])
-        found[key] = f"{_coloured(word)} {row['improvement'][0]:.2f}<br>{_ratio(ratios.get(key))}"
+        shown = f"{_coloured(word)} {row['improvement'][0]:.2f}<br>{_ratio(ratios.get(key))}"
+        found[key] = Cell(word, shown)
     return found
+
+
+def screen_answer() -> str | None:
+    """Says in a sentence what the screen has found so far; None if nothing is trained."""
+    words: dict[str, dict[str, str]] = {}
+    for name in SCREENS:
+        if results := load(name):
+            for (label, task), cell in words_of(results, summarize(results)).items():
+                if not label.endswith(RANDOM_CONTROL):
+                    words.setdefault(label, {})[task] = cell.word
+    if not words:
+        return None
+    planned = [task for name in SCREENS for task in load_spec(name).tasks]
+    tasks = [task for task in planned if any(task in found for found in words.values())]
+    whole = [task for task in tasks if all(task in found for found in words.values())]
+    better = [f"`{label}`" for label, found in words.items() if "better" in found.values()]
+    worse = [label for label, found in words.items() if "worse" in found.values()]
+    part = f", in part on {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""
+    return (
+        f"**not decided**: screened with 5 seeds on {len(whole)} of {len(planned)} tasks{part}; by "
+        f"its interval {', '.join(better) or 'no rule'} is better than `ppo` on one of them at "
+        f"least, and {len(worse)} of {len(words)} rules are worse on one at least"
+    )
 
 
 def word_of(improvement: Sequence[float | None], own: np.ndarray, base: np.ndarray) -> str:

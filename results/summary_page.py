@@ -9,6 +9,7 @@ from typing import Any
 
 from claims import HEADER, Count, claims_rows, count, sentences, short_answer
 from measured_pages import noise_answer, posture_answer, sweep_answer
+from selection_page import screen_answer
 from studies import (
     CLAIMED,
     FILES,
@@ -70,6 +71,9 @@ def findings(prefix: str, short: bool = False) -> str:
     for text, arm, name, answer in said:
         if measured := load(name):
             rows.append([text, f"`{arm}`", answer(measured), _link(name, prefix)])
+    if screened := screen_answer():
+        link = f"[selection]({prefix}selection.md)"
+        rows.append(["Another published rule of selection helps", "all rules", screened, link])
     return markdown(rows)
 
 

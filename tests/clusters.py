@@ -21,7 +21,8 @@ import pytest
 from helpers import environment
 
 MARK = "SAUNA_TEST_CLUSTER"  # in the environment of every process that a test starts
-CLOCKS = ("learner_cpu_seconds", "equal_compute")  # read, or made from what is read, off a clock
+# Read, or made from what is read, off a clock.
+CLOCKS = ("learner_cpu_seconds", "cpu_seconds", "equal_compute")
 
 needs_ray = pytest.mark.skipif(
     importlib.util.find_spec("ray") is None,

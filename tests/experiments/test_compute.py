@@ -15,6 +15,7 @@ from sauna.experiments.compute import (
     joined,
     learner_seconds,
     reached,
+    training_seconds,
 )
 
 
@@ -38,6 +39,19 @@ def test_the_iteration_that_compiles_counts_as_the_next() -> None:
     ]
     assert learner_seconds(timings, "ppo/0") == {0: 0.5, 1: 0.5, 3: 7.0}
     assert learner_seconds(timings, "ppo/1") == {0: 8.0}
+
+
+def test_a_training_takes_its_learning_and_its_share_of_what_members_do_together() -> None:
+    host = [
+        {"iteration": 0, "collect_cpu_seconds": 90.0, "update_cpu_seconds": {"a/0": 5, "b/0": 6}},
+        {"iteration": 1, "collect_cpu_seconds": 4.0, "update_cpu_seconds": {"a/0": 1, "b/0": 2}},
+        {"iteration": 2, "collect_cpu_seconds": 4.0, "update_cpu_seconds": {"a/0": 1}},
+        {"iteration": 3, "seconds": 1.0},  # of a run of before
+    ]
+    assert training_seconds(host, "a/0") == {0: 3.0, 1: 3.0, 2: 5.0}
+    assert training_seconds(host, "b/0") == {0: 4.0, 1: 4.0}
+    device = [{"iteration": 0, "cpu_seconds": {"a/0": 0.5}}]
+    assert training_seconds(device, "a/0") == {0: 0.5}
 
 
 def test_a_level_is_reached_between_two_points() -> None:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from helpers import SMALL
+from sauna.experiments.compute import training_seconds
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import SaunaError
 from sauna.training import run as runs
@@ -88,4 +89,9 @@ def test_a_run_that_pauses_is_saved_there_and_goes_on_to_the_same_bytes(
             run, resume = runs.reopen(run.path, {}, PlainDisplay()), True
         run.lock.close()
         files.append((run.path / "metrics.jsonl").read_bytes())
+        timings = run_directory.rows(run.path, "timing.jsonl")
+        for member in ("ppo/0", "ppo/1"):
+            seconds = training_seconds(timings, member)
+            assert [*seconds] == [row["iteration"] for row in timings]
+            assert all(value > 0 for value in seconds.values())
     assert files[0] == files[1]

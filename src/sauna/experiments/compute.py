@@ -1,10 +1,11 @@
 """How much compute an arm needs to get as far as the baseline gets.
 
 Compute is a count that only grows along a curve: samples through the gradient, or CPU seconds of
-the learner. The level to reach is the baseline's mean final return. An arm's compute is that of the
-first point where its mean curve is at the level; the baseline's is found in the same way, so that
-an arm that is the baseline has the ratio 1, however early the baseline levels off. A baseline that
-has not risen above its start gives no level: any arm is there at once.
+the learner or of the whole training. The level to reach is the baseline's mean final return. An
+arm's compute is that of the first point where its mean curve is at the level; the baseline's is
+found in the same way, so that an arm that is the baseline has the ratio 1, however early the
+baseline levels off. A baseline that has not risen above its start gives no level: any arm is there
+at once.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ GRID = 60  # points of a drawn curve at most
 AXES = {
     "samples_backward": "samples learned from",
     "learner_cpu_seconds": "CPU seconds of the learner",
+    "cpu_seconds": "CPU seconds of the training",
 }
 
 
@@ -64,14 +66,39 @@ def learner_seconds(timings: Sequence[dict[str, Any]], member: str) -> dict[int,
       timings: the rows of `timing.jsonl`.
       member: its name, `sauna/0`.
     """
-    found = {
-        row["iteration"]: float(row["update_cpu_seconds"][member])
-        for row in timings
-        if member in row.get("update_cpu_seconds", {})
-    }
-    if {0, 1} <= found.keys():
-        found[0] = min(found[0], found[1])
-    return found
+    return _without_compiling(
+        {
+            row["iteration"]: float(row["update_cpu_seconds"][member])
+            for row in timings
+            if member in row.get("update_cpu_seconds", {})
+        }
+    )
+
+
+def training_seconds(timings: Sequence[dict[str, Any]], member: str) -> dict[int, float]:
+    """Returns a member's CPU seconds of collecting and learning in each iteration, where known.
+
+    What the members of a run do together counts for each of them alike: on the host collecting,
+    on the device all.
+
+    Args:
+      timings, member: as of `learner_seconds`.
+    """
+    found = {}
+    for row in timings:
+        learning = row.get("update_cpu_seconds", {})
+        if member in row.get("cpu_seconds", {}):
+            found[row["iteration"]] = float(row["cpu_seconds"][member])
+        elif member in learning and "collect_cpu_seconds" in row:
+            collecting = row["collect_cpu_seconds"] / len(learning)
+            found[row["iteration"]] = float(collecting + learning[member])
+    return _without_compiling(found)
+
+
+def _without_compiling(seconds: dict[int, float]) -> dict[int, float]:
+    if {0, 1} <= seconds.keys():
+        seconds[0] = min(seconds[0], seconds[1])
+    return seconds
 
 
 def joined(curves: Sequence[tuple[Any, Any]]) -> Curves | None:

@@ -324,6 +324,8 @@ class Coordinator:
                 for t in timings
                 for member, seconds in t["update_cpu_seconds"].items()
             }
+        if all("cpu_seconds" in timing for timing in timings):  # on the device, by a CPU
+            timing["cpu_seconds"] = {m: s for t in timings for m, s in t["cpu_seconds"].items()}
         if any("evaluation_seconds" in timing for timing in timings):
             timing["evaluation_seconds"] = max(t.get("evaluation_seconds", 0.0) for t in timings)
         warnings = [*self._empty_updates.see(rows), *map(self._info_names.admit, rows)]

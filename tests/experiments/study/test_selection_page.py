@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import selection_page
 from selection_page import arms, difference_interval, word_of, words_of
 
 from sauna.experiments.study.summary import summarize
@@ -82,7 +83,29 @@ def test_a_cell_says_the_word_the_probability_and_the_share_of_compute() -> None
     words = words_of(results, summary)
     assert set(words) == {("half", "A-v5"), ("low", "A-v5")}
     # 100 of 150 is reached after two thirds of 500 samples, a third of the 1000 of `ppo`.
-    assert words["half", "A-v5"].startswith('<span class="better">better</span> 1.00<br>x 0.33 [')
-    assert words["low", "A-v5"].startswith('<span class="worse">worse</span> 0.00<br>not reached')
+    half, low = words["half", "A-v5"], words["low", "A-v5"]
+    assert half.shown.startswith('<span class="better">better</span> 1.00<br>x 0.33 [')
+    assert low.shown.startswith('<span class="worse">worse</span> 0.00<br>not reached')
     assert "| `half` | 5 | 0 | 150.0 ± 0.8 |" in arms("A-v5", summary)
     assert "0.50 of PPO's" in arms("A-v5", summary)
+
+
+def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selection_page, "load", lambda name: None)
+    assert selection_page.screen_answer() is None
+
+    def on(task: str, *cells: dict[str, Any]) -> dict[str, Any]:
+        of_task = [{**own, "task": task} for own in cells]
+        return {"format": 1, "baseline": "ppo", "cells": of_task, "settings": {}}
+
+    ppo, high = cell("ppo", BASE, 1000.0), cell("high", BASE + 50, 1000.0)
+    low, control = cell("low", BASE - 50, 1000.0), cell("low+random", BASE + 50, 1000.0)
+    found = {
+        "selection-screen-cartpole": on("CartPole-v1", ppo, high, low, control),
+        "selection-screen-mujoco": on("Hopper-v5", ppo, high),
+    }
+    monkeypatch.setattr(selection_page, "load", found.get)
+    answer = selection_page.screen_answer()
+    assert answer is not None
+    assert "on 1 of 8 tasks, in part on 1 more; by its interval `high` is better" in answer
+    assert "1 of 2 rules are worse" in answer

@@ -156,5 +156,6 @@ def main(settings: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    os.environ |= {"PJRT_NPROC": "1", "JAX_PLATFORMS": "cpu"}  # as JAX reads them, before it starts
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.environ.setdefault("PJRT_NPROC", "1")  # threads, as in our own trainings
     main(json.loads(sys.argv[1]))

@@ -22,7 +22,7 @@ from typing import Any
 from sauna.experiments.bench.peer_settings import GYMNAX_PEERS
 from sauna.system.errors import BadInput, SaunaError
 
-_WITH_JAX = ["jax[cpu]", "gymnax==0.0.9"]
+_WITH_JAX = ["jax[cpu]==0.10.2", "distrax==0.1.9", "gymnax==0.0.9"]
 # What each peer needs, beside PyTorch where it is not in JAX. CleanRL and PureJaxRL are scripts, of
 # which the user names a copy. Both in JAX read five values of a step, and gymnax 1 returns six.
 PEERS = {
@@ -34,7 +34,7 @@ PEERS = {
     ],
     "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
     "rejax": ["rejax==0.1.3", *_WITH_JAX],
-    "purejaxrl": ["flax", "optax", "distrax", *_WITH_JAX],
+    "purejaxrl": ["flax", "optax", *_WITH_JAX],
 }
 # CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
 _TORCH = (

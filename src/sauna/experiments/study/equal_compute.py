@@ -12,15 +12,20 @@ from sauna.experiments.statistics import mean_interval
 from sauna.experiments.study.cells import Cell
 
 ABOUT = (
-    "Each sentence says how much compute of the learner an arm takes until its mean curve first "
+    "Each sentence says how much compute an arm takes until its mean curve first "
     "reaches the baseline's mean final return, as a multiple of what the baseline itself takes "
     "until then: 0.5 is half of it. Compute is counted in samples that pass through the gradient, "
-    "and in CPU seconds of the learner. The interval is a percentile bootstrap over seeds, too "
-    "narrow with few of them; no verdict rests on it. Nothing is said if the baseline has one "
-    "seed, or if its return has not risen by more than its noise. "
+    "in CPU seconds of the learner, and in CPU seconds of the training, which are those of "
+    "collecting as well. On the device the two cannot be told apart. The interval is a percentile "
+    "bootstrap over seeds, too narrow with few of them; no verdict rests on it. Nothing is said if "
+    "the baseline has one seed, or if its return has not risen by more than its noise. "
     "CPU seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
-WORDS = {"samples_backward": "in samples", "learner_cpu_seconds": "in CPU seconds"}
+WORDS = {
+    "samples_backward": "in samples",
+    "learner_cpu_seconds": "in CPU seconds of the learner",
+    "cpu_seconds": "in CPU seconds of the training",
+}
 
 
 def curves_over(cell: Cell, axis: str) -> Curves | None:

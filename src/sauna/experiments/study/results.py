@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sauna.config.settings import flag, to_json
-from sauna.experiments.compute import cumulated, learner_seconds
+from sauna.experiments.compute import cumulated, learner_seconds, training_seconds
 from sauna.experiments.curves import area_under_curve
 from sauna.experiments.study.evaluations import evaluated
 from sauna.experiments.study.rounds import tournament_of
@@ -181,10 +181,12 @@ def _compute(
     """What a member's learning has taken up to each row, for what was recorded."""
     if not rows:
         return {}
-    seconds = learner_seconds(timings, rows[0].get("member", ""))
+    member, iterations = rows[0].get("member", ""), [row.get("iteration", -1) for row in rows]
+    learner, whole = learner_seconds(timings, member), training_seconds(timings, member)
     found = {
         "samples_backward": cumulated([row.get("samples_backward") for row in rows]),
-        "learner_cpu_seconds": cumulated([seconds.get(row.get("iteration", -1)) for row in rows]),
+        "learner_cpu_seconds": cumulated([*map(learner.get, iterations)]),
+        "cpu_seconds": cumulated([*map(whole.get, iterations)]),
     }
     return {name: values for name, values in found.items() if values[0] is not None}
 

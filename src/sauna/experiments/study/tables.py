@@ -34,6 +34,7 @@ SEED_COLUMNS = {
     "episodes": "Episodes",
     "samples_backward": "Samples learned from",
     "learner_cpu_seconds": "Learner CPU seconds",
+    "cpu_seconds": "CPU seconds",
 }
 OF_EVALUATIONS = ("eval_return", "eval_return_best")  # left out where no member has any
 FORMER_KEYS = {"auc": "area"}  # in results of 0.1.0

@@ -105,9 +105,9 @@ def train_on_device(job: Job, reporter: Reporter) -> None:
         if not number or not any(budget_left(config, c) for c in counters):
             break
         population.stop([p for p, own in enumerate(counters) if own.stopped])
-        clock = time.perf_counter()
+        clock, cpu = time.perf_counter(), time.process_time()
         reports = population.run(iteration, number)
-        seconds = time.perf_counter() - clock
+        seconds = time.perf_counter() - clock, time.process_time() - cpu
         watch = evaluator, population
         iteration = _report(job, reporter, iteration, reports, counters, seconds, watch)
         if iteration % config.checkpoint_every == 0:
@@ -173,12 +173,13 @@ def _report(
     first: int,
     reports: list[Report],
     counters: list[Counters],
-    seconds: float,
+    seconds: tuple[float, float],
     watch: tuple[Evaluator, Population],
 ) -> int:
     """Reports what one call ran; the iteration that comes next.
 
     Args:
+      seconds: of the call, by the wall clock and of this process's CPU time.
       watch: what evaluates a member if that is due (then the iteration is the call's last), and
         who they are.
     """
@@ -199,7 +200,10 @@ def _report(
             row = metrics_row(member, job.config, first + i, collected, counters[p], *now)
             frozen = partial(_frozen, population, p)
             rows.append(row | evaluator.after(p, counters[p], before, frozen))
-        timing = {"env_steps": steps, "seconds": seconds / number}
+        timing: dict[str, Any] = {"env_steps": steps, "seconds": seconds[0] / number}
+        if job.config.device == "cpu" and not job.config.distributed:  # else it runs elsewhere, too
+            each = seconds[1] / number / len(rows)
+            timing["cpu_seconds"] = {row["member"]: each for row in rows}
         if evaluating := evaluator.seconds - evaluated:
             timing["evaluation_seconds"] = evaluating
         reporter.iteration(first + i, rows, timing)
