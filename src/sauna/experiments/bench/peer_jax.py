@@ -11,7 +11,7 @@ rollout, minibatches, epochs, both networks, and the numbers of the loss and of 
 
 Not equal:
 
-- JAX and gymnax are older: gymnax 1 returns six values from a step, and both read five.
+- gymnax is older: since version 1 a step returns six values, and both read five.
 - Both take a time limit for an end. We bootstrap the value there.
 - rejax clips each element of a gradient at `max_grad_norm`. We and PureJaxRL clip the norm.
 - rejax leaves Adam's epsilon at 1e-8 and starts from flax's usual weights.
