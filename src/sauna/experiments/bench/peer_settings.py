@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import FIELDS, Config
 from sauna.system.errors import BadInput
 
@@ -38,6 +39,27 @@ _PPO: Mapping[str, Any] = dict.fromkeys(
     ),
     _ANY,
 )
+# What both trainers of gymnax's environments read.
+_ON_DEVICE: Mapping[str, Any] = {
+    **dict.fromkeys(
+        (
+            "env",
+            "envs",
+            "rollout_steps",
+            "minibatches",
+            "epochs",
+            "learning_rate",
+            "max_grad_norm",
+            "clip_range",
+            "entropy_coef",
+            "value_coef",
+            "gamma",
+            "gae_lambda",
+        ),
+        _ANY,
+    ),
+    "learning_rate_schedule": ("constant", "linear"),
+}
 # Of each peer, the settings of learning that it reads, with the values that it knows. CleanRL's
 # script has numbers of its own: those of preset mujoco, which are our defaults.
 READ: dict[str, Mapping[str, Any]] = {
@@ -50,13 +72,25 @@ READ: dict[str, Mapping[str, Any]] = {
         "distribution": ("gaussian", "gsde"),
     },
     "cleanrl": {"env": _ANY},
+    "rejax": {
+        **_ON_DEVICE,
+        "env_kwargs": _ANY,
+        "value_hidden": _ANY,
+        "normalize_observations": _ANY,
+        "normalize_rewards": _ANY,
+        "hidden": _ANY,
+        "activation": ACTIVATIONS,
+    },
+    "purejaxrl": {**_ON_DEVICE, "hidden": ((64, 64),), "activation": ("tanh", "relu")},
 }
+GYMNAX_PEERS = ("rejax", "purejaxrl")  # they have environments on the device, and no others
 _LEARNING = ("task", "learning", "network", "normalisation")
 _COSTLESS = ("rescale_actions",)  # a multiplication of each action, or none
-# What a preset may differ in from the defaults, and what of it a peer does by itself.
+# What a preset or a peer may differ in from the defaults, and what of it a peer does by itself.
 _ALONE: dict[str, dict[str, Any]] = {
     "a2c": {"optimizer": "rmsprop", "trunk": "separate"},
     "atari": {"trunk": "shared", "sign_rewards": True},
+    "purejaxrl": {"normalize_observations": False, "normalize_rewards": False},
 }
 
 
@@ -77,7 +111,13 @@ def peer_settings(peer: str, config: Config) -> dict[str, Any]:
         atari and config.algorithm != "ppo"
     ):
         raise BadInput(f"against: {peer} is run with PPO, not with {config.algorithm}")
-    alone = {**_ALONE.get(config.algorithm, {}), **(_ALONE["atari"] if atari else {})}
+    if peer in GYMNAX_PEERS and not config.env.startswith("gymnax/"):
+        raise BadInput(f"against: {peer} cannot train {config.env}; it has gymnax's environments")
+    alone = {
+        **_ALONE.get(config.algorithm, {}),
+        **(_ALONE["atari"] if atari else {}),
+        **_ALONE.get(peer, {}),
+    }
     for name, known in read.items():
         if known is not _ANY and getattr(config, name) not in known:
             raise BadInput(f"{name}: {peer} has no {getattr(config, name)}")
