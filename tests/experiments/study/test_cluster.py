@@ -343,8 +343,7 @@ def test_a_failing_seed_is_reported_and_the_others_complete(place: Place) -> Non
     results = json.loads((place.path / "ray/runs/mine/results.json").read_text())
     for cell in results["cells"]:
         assert [m["status"] for m in cell["members"]] == ["complete", "failed"]
-    assert "out of luck" in results["cells"][0]["members"][1]["error"]
-    assert "drop rates" in results["cells"][1]["members"][1]["error"]
+        assert "out of luck" in cell["members"][1]["error"]
 
 
 @slow
