@@ -179,9 +179,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     bench.add_argument(
         "env", nargs="?", metavar="ENV", default="HalfCheetah-v5", help="default: HalfCheetah-v5"
     )
-    bench.add_argument(
-        "--against", metavar="PEER", help="also run another trainer: sb3, cleanrl, brax"
-    )
+    text = "also run another trainer: sb3, cleanrl, brax, rltools, rl_games"
+    bench.add_argument("--against", metavar="PEER", help=text)
     text = "with --against cleanrl: your copy of its ppo_continuous_action.py"
     bench.add_argument("--script", metavar="FILE", help=text)
     bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")

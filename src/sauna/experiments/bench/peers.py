@@ -21,7 +21,8 @@ from typing import Any
 
 from sauna.system.errors import BadInput, SaunaError
 
-# What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy.
+# What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy. RLtools
+# finds Intel's MKL by itself; without it, it looks for another BLAS.
 PEERS = {
     "sb3": [
         "stable-baselines3==2.9.2",
@@ -30,7 +31,14 @@ PEERS = {
         "opencv-python-headless",
     ],
     "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
+    "rltools": [
+        "rltools==2.2.1",
+        "gymnasium[mujoco]",
+        *(f"{name}; platform_machine == 'x86_64'" for name in ("mkl", "mkl-include")),
+    ],
+    "rl_games": ["rl_games==1.6.5", "envpool==1.2.5"],
 }
+_WITHOUT_TORCH = ("rltools",)
 # CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
 _TORCH = (
     ["torch", "--index-url", "https://download.pytorch.org/whl/cpu"],
@@ -57,9 +65,11 @@ def prepare(peer: str, say: Callable[[str], None]) -> Path:
     done, wanted = folder / "complete", " ".join(PEERS[peer])
     failed = None
     if not done.exists():
-        say(f"installing {PEERS[peer][0]} and PyTorch (CPU) into {folder}, once")
+        torch = () if peer in _WITHOUT_TORCH else _TORCH
+        also = " and PyTorch (CPU)" if torch else ""
+        say(f"installing {PEERS[peer][0]}{also} into {folder}, once")
         venv.create(folder, with_pip=True, clear=True)
-        for attempt in _TORCH:
+        for attempt in torch:
             failed = _pip(python, attempt)
             if failed is None:
                 break
@@ -158,7 +168,8 @@ def versions(python: Path) -> dict[str, str]:
     code = (
         "import importlib.metadata as m, json; "
         "names = {d.name for d in m.distributions()}; "
-        "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy'); "
+        "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy', "
+        "'rltools', 'mkl', 'rl-games', 'envpool'); "
         "print(json.dumps({n: m.version(n) for n in wanted if n in names}))"
     )
     command = [str(python), "-c", code]
