@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from sauna import __version__
 from sauna.config.accepted import translate
-from sauna.config.choices import LISTS
+from sauna.config.choices import LISTS, PEERS
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint, spread_hint
 from sauna.config.parsing import whole_number
@@ -179,9 +179,9 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     bench.add_argument(
         "env", nargs="?", metavar="ENV", default="HalfCheetah-v5", help="default: HalfCheetah-v5"
     )
-    text = "also run another trainer: sb3, cleanrl, brax, rltools, rl_games"
+    text = f"also run another trainer: {', '.join(PEERS)}"
     bench.add_argument("--against", metavar="PEER", help=text)
-    text = "with --against cleanrl: your copy of its ppo_continuous_action.py"
+    text = "your copy of cleanrl's ppo_continuous_action.py or of purejaxrl's ppo.py"
     bench.add_argument("--script", metavar="FILE", help=text)
     bench.add_argument("--rounds", default="3", help="how often, in turn (default 3)")
     text = "iterations of each round's training (default 50)"

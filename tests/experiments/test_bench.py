@@ -13,11 +13,14 @@ import pytest
 
 from sauna import cli
 from sauna.config.presets import resolve
-from sauna.experiments.bench import command, scale
-from sauna.experiments.bench.peer_settings import peer_settings
+from sauna.experiments.bench import command, peer_jax, scale
+from sauna.experiments.bench.peer_settings import GYMNAX_PEERS, peer_settings
+from sauna.experiments.bench.peers import peer_rate
 from sauna.experiments.bench.rates import Clock, alternate, physics_rate, ratio, simulator
 from sauna.experiments.bench.split import SECTIONS, Timers, split
 from sauna.system.errors import BadInput
+
+POLE = "gymnax/CartPole-v1"
 
 
 def test_the_rate_leaves_out_the_warm_up() -> None:
@@ -142,6 +145,16 @@ def test_the_report_shows_every_figure() -> None:
         (["jax_envs:walk", "--processes", "2"], "processes: not read"),
         (["jax_envs:walk", "--against", "brax"], "brax cannot train"),
         (["brax/ant", "--against", "brax"], "give --seeds 1"),
+        ([POLE, "--against", "sb3"], "sb3 has no environments on the device"),
+        (["jax_envs:walk", "--against", "rejax"], "rejax cannot train jax_envs:walk"),
+        (["--against", "rejax"], "rejax cannot train HalfCheetah-v5"),
+        ([POLE, "--against", "rejax"], "rejax trains one member; give --seeds 1"),
+        ([POLE, "--against", "rejax", "--no-clip-value"], "which has True"),
+        ([POLE, "--against", "rejax", "--seeds", "1", "--devices", "2"], "is run on one CPU"),
+        ([POLE, "--against", "purejaxrl"], "your copy of its ppo.py"),
+        ([POLE, "--against", "purejaxrl", "--script", "no.py"], "no.py is not a file"),
+        ([POLE, "--against", "purejaxrl", "--script", __file__], "wrappers.py, which test_bench"),
+        ([POLE, "--against", "rejax", "--script", __file__], "script: read with --against cleanrl"),
         (["brax/ant", "--against", "brax", "--seeds", "1", "--envs", "3"], "not divisible by 32"),
     ],
 )
@@ -250,6 +263,90 @@ def test_rl_games_is_configured_with_the_settings_of_the_run(tmp_path, monkeypat
     names.list_all_envs = list
     with pytest.raises(SystemExit, match="EnvPool 1 has no InvertedPendulum-v5"):
         run_script("rl_games", monkeypatch, tmp_path, capsys, **given)
+
+
+MINATAR = {"env": "gymnax/Breakout-MinAtar", "arm": "ppo", "preset": "minatar"}
+
+
+def test_peers_on_the_device_get_the_settings_of_the_run() -> None:
+    config = resolve(MINATAR)
+    for peer in GYMNAX_PEERS:
+        found = peer_settings(peer, config)
+        assert (found["envs"], found["rollout_steps"], found["minibatches"]) == (64, 128, 8)
+        assert (found["activation"], found["entropy_coef"]) == ("relu", 0.01)
+    with pytest.raises(BadInput, match="normalize_rewards: not read by purejaxrl, which has False"):
+        peer_settings("purejaxrl", resolve({**MINATAR, "normalize_rewards": True}))
+    with pytest.raises(BadInput, match="hidden: purejaxrl has no"):
+        peer_settings("purejaxrl", resolve({**MINATAR, "hidden": "32"}))
+
+
+SCRIPT = """
+import json
+import jax
+import wrappers
+
+def make_train(config):
+    open(config["ENV_NAME"], "a").write(json.dumps(config) + chr(10))
+    return lambda key: jax.random.normal(key, (2,))
+"""
+
+
+def test_purejaxrls_script_is_run_with_the_settings_of_the_run(tmp_path, monkeypatch) -> None:
+    (tmp_path / "ppo.py").write_text(SCRIPT.replace('config["ENV_NAME"]', repr(f"{tmp_path}/log")))
+    training = "from brax.envs.wrappers.training import EpisodeWrapper, AutoResetWrapper"
+    (tmp_path / "wrappers.py").write_text(f"from brax import envs\n{training}\nimport navix as nx")
+    settings = peer_settings("purejaxrl", resolve(MINATAR))
+    found = peer_rate("purejaxrl", Path(sys.executable), tmp_path / "ppo.py", settings, 1, 1e-9)
+    assert found > 0
+    (config,) = map(json.loads, (tmp_path / "log").read_text().splitlines())
+    assert config["ENV_NAME"] == "Breakout-MinAtar"
+    assert config["TOTAL_TIMESTEPS"] == peer_jax.FEW * 64 * 128
+    assert (config["NUM_MINIBATCHES"], config["UPDATE_EPOCHS"], config["LR"]) == (8, 4, 5e-3)
+    assert config["ANNEAL_LR"] is True
+
+
+def test_rejax_is_created_with_the_settings_of_the_run(monkeypatch) -> None:
+    agents: list[dict] = []
+
+    class PPO:
+        def __init__(self, **settings) -> None:
+            agents.append(settings)
+
+        create = replace = classmethod(lambda cls, **settings: cls(**settings))
+
+        def train(self, key):
+            return key, None
+
+    rejax = SimpleNamespace(PPO=PPO)
+    networks = SimpleNamespace(VNetwork=lambda hidden, activation: (hidden, activation.__name__))
+    monkeypatch.setitem(sys.modules, "rejax", rejax)
+    monkeypatch.setitem(sys.modules, "rejax.networks", networks)
+    config = resolve({**MINATAR, "value_hidden": "32", "env_kwargs": '{"max_steps_in_episode": 9}'})
+    settings = {**peer_settings("rejax", config), "env": "Breakout-MinAtar"}
+    assert peer_jax.rejax_training(settings, 10)("key") == "key"
+    created, replaced = agents
+    assert (created["num_envs"], created["num_steps"], created["num_minibatches"]) == (64, 128, 8)
+    assert created["agent_kwargs"] == {"hidden_layer_sizes": (64, 64), "activation": "relu"}
+    assert created["env_params"].max_steps_in_episode == 9
+    assert created["total_timesteps"] == created["eval_freq"] == 10 * 64 * 128
+    assert [float(created["learning_rate"](n)) for n in (0, 320)] == [pytest.approx(5e-3), 0.0]
+    assert replaced["critic"] == ((32,), "relu")
+
+
+def test_a_training_is_prolonged_until_it_takes_the_seconds(monkeypatch) -> None:
+    now, tried = [0.0], []
+
+    def ran(result):
+        now[0] += 0.1 * tried[-1]
+
+    def training(iterations):
+        tried.append(iterations)
+        return lambda key: key
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr("jax.block_until_ready", ran)
+    assert peer_jax.env_steps_per_second(training, 50, 15.0, 0) == pytest.approx(500)
+    assert tried == [16, 180]
 
 
 @pytest.mark.slow

@@ -13,11 +13,15 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 from sauna.config.presets import plain, resolve, resolve_run
 from sauna.config.settings import Config
+from sauna.experiments.bench.command import SECONDS
+from sauna.experiments.bench.peer_settings import GYMNAX_PEERS, peer_settings
+from sauna.experiments.bench.peers import peer_rate, prepare, versions
 from sauna.experiments.bench.rates import ratio
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -35,9 +39,16 @@ def bench_on_device(
     iterations: int,
     rounds: int,
     against: str | None,
+    script: Path | None,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Measures a population on the device; `against` may be `brax`.
+    """Measures a population on the device.
+
+    Args:
+      iterations: of each round.
+      rounds: how often everything is measured, in turn.
+      against: `brax`, `rejax`, `purejaxrl` or None; script: the file that `purejaxrl` is.
+      say: receives a line for each figure.
 
     Returns:
       the figures; rates are env steps per second of all members and environments.
@@ -47,17 +58,17 @@ def bench_on_device(
     """
     overrides = _on_device(overrides, 100 * iterations)
     config = place(resolve_run(overrides)).config
-    if against and against != "brax":
-        raise BadInput(f"against: {against} has no environments on the device; brax has")
-    if against:
-        _check_peer(config)
     measures: dict[str, Callable[[], dict[str, float]]] = {
         "sauna": lambda: _elsewhere("sauna.experiments.bench.device", overrides, iterations)
     }
-    if against:
+    about_peer = {}
+    if against == "brax":
+        _check_brax(config)
         measures["brax"] = lambda: _elsewhere(
             "sauna.experiments.bench.peer_brax", overrides, iterations
         )
+    elif against:
+        measures[against], about_peer["peer"] = _gymnax_peer(against, config, script, say)
     found: list[dict[str, float]] = []
     for number in range(rounds):
         round_: dict[str, float] = {}
@@ -79,6 +90,7 @@ def bench_on_device(
         "machine": {**run_directory.machine(), "device": device_name(config)},
         "versions": run_directory.versions(),
         "git": run_directory.git_revision(),
+        **about_peer,
         "rates": rates,
         "ratios": {n: ratio(rates["whole"], r) for n, r in rates.items() if n != "whole"},
         "compile_seconds": [each["compile_seconds"] for each in found],
@@ -86,7 +98,36 @@ def bench_on_device(
     }
 
 
-def _check_peer(config: Config) -> None:
+def _gymnax_peer(
+    peer: str, config: Config, script: Path | None, say: Callable[[str], None]
+) -> tuple[Callable[[], dict[str, float]], dict[str, Any]]:
+    """What measures a peer in an environment of its own, and what is noted of it.
+
+    Raises:
+      BadInput: it cannot train likewise; the field is named.
+      SaunaError: it cannot be installed.
+    """
+    if peer not in GYMNAX_PEERS:
+        known = ", ".join(("brax", *GYMNAX_PEERS))
+        raise BadInput(f"against: {peer} has no environments on the device; {known} have")
+    settings = peer_settings(peer, config)
+    _check_one_member(peer, config)
+    if config.device != "cpu" or config.devices > 1:
+        raise BadInput(f"against: {peer} is run on one CPU; give --device cpu --devices 1")
+    python = prepare(peer, say)
+
+    def measure() -> dict[str, float]:
+        return {peer: peer_rate(peer, python, script, settings, 1, SECONDS)}
+
+    return measure, {"name": peer, "versions": versions(python), "settings": settings}
+
+
+def _check_one_member(peer: str, config: Config) -> None:
+    if len(config.seeds) * len(config.arm) > 1:
+        raise BadInput(f"against: {peer} trains one member; give --seeds 1")
+
+
+def _check_brax(config: Config) -> None:
     """Refuses what Brax's PPO cannot do likewise.
 
     Raises:
@@ -96,8 +137,7 @@ def _check_peer(config: Config) -> None:
         raise BadInput(f"against: brax is run with PPO, not with {config.algorithm}")
     if config.env.split("/")[0] not in ("brax", "playground"):
         raise BadInput(f"against: brax cannot train {config.env}")
-    if len(config.seeds) * len(config.arm) > 1:
-        raise BadInput("against: brax trains one member; give --seeds 1")
+    _check_one_member("brax", config)
     if config.envs % config.minibatches:
         raise BadInput(
             f"minibatches: brax shares environments over them, and {config.envs} are "
@@ -119,7 +159,7 @@ def _on_device(overrides: Mapping[str, Any], iterations: int) -> dict[str, Any]:
 
 
 def _text(round_: Mapping[str, float], name: str) -> str:
-    wanted = ("brax",) if name == "brax" else ("physics", "collect", "update", "whole")
+    wanted = ("physics", "collect", "update", "whole") if name == "sauna" else (name,)
     return ", ".join(f"{part} {round_[part]:,.0f}" for part in wanted) + " env steps/s"
 
 
@@ -292,6 +332,8 @@ def report_on_device(result: Mapping[str, Any]) -> list[str]:
         "collect": "collecting alone",
         "update": "updating alone",
         "brax": "Brax's PPO",
+        "rejax": "rejax's PPO",
+        "purejaxrl": "PureJaxRL's script",
     }
     for name, found in result["ratios"].items():
         lines.append(

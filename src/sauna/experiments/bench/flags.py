@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.accepted import translate
+from sauna.config.choices import PEER_SCRIPTS
 from sauna.config.parsing import whole_number
 from sauna.config.presets import plain, resolve_run
 from sauna.experiments.bench.command import bench, bench_scale, report
@@ -32,9 +33,7 @@ def bench_from_flags(values: dict[str, Any], say: Callable[[str], None]) -> None
     against, file = values.pop("against"), values.pop("json")
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")
-    script = values["script"]
-    if (against == "cleanrl") != bool(script) or (script and not Path(script).is_file()):
-        raise BadInput("script: --against cleanrl needs --script FILE, and nothing else reads it")
+    script = _script(against, values["script"])
     for name in ("rounds", "iterations", "script"):
         del values[name]
     overrides = {"seeds": 6, **translate({"arm": "ppo", **values})}
@@ -43,17 +42,38 @@ def bench_from_flags(values: dict[str, Any], say: Callable[[str], None]) -> None
         result = scale_on_device(overrides, rounds, iterations, say)
     elif native:
         result = bench_on_device(
-            overrides, rounds=rounds, iterations=iterations, against=against, say=say
+            overrides, rounds=rounds, iterations=iterations, against=against, script=script, say=say
         )
         print("\n".join(report_on_device(result)))
     elif scale:
         result = bench_scale(overrides, rounds, say)
     else:
-        path = Path(script) if script else None
         result = bench(
-            overrides, rounds=rounds, iterations=iterations, against=against, script=path, say=say
+            overrides, rounds=rounds, iterations=iterations, against=against, script=script, say=say
         )
         print("\n".join(report(result)))
     if file:
         Path(file).write_text(json.dumps(result, indent=1) + "\n")
         print(f"figures: {file}")
+
+
+def _script(against: str | None, script: str | None) -> Path | None:
+    """The file that a peer is, where it is one.
+
+    Raises:
+      BadInput: the peer needs it, or does not read it, or it is not there.
+    """
+    if against not in PEER_SCRIPTS:
+        if script:
+            known = " and ".join(PEER_SCRIPTS)
+            raise BadInput(f"script: read with --against {known} alone")
+        return None
+    if not script:
+        wanted = f"your copy of its {PEER_SCRIPTS[against]}"
+        raise BadInput(f"script: --against {against} needs --script FILE, {wanted}")
+    path = Path(script)
+    if not path.is_file():
+        raise BadInput(f"script: {script} is not a file")
+    if against == "purejaxrl" and not path.with_name("wrappers.py").is_file():
+        raise BadInput(f"script: wrappers.py, which {path.name} imports, is not beside it")
+    return path

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import FIELDS, Config
 from sauna.envs.make import is_mujoco
 from sauna.system.errors import BadInput
@@ -39,6 +40,27 @@ _PPO: Mapping[str, Any] = dict.fromkeys(
     ),
     _ANY,
 )
+# What both trainers of gymnax's environments read.
+_ON_DEVICE: Mapping[str, Any] = {
+    **dict.fromkeys(
+        (
+            "env",
+            "envs",
+            "rollout_steps",
+            "minibatches",
+            "epochs",
+            "learning_rate",
+            "max_grad_norm",
+            "clip_range",
+            "entropy_coef",
+            "value_coef",
+            "gamma",
+            "gae_lambda",
+        ),
+        _ANY,
+    ),
+    "learning_rate_schedule": ("constant", "linear"),
+}
 
 
 def _one_width(hidden: tuple[int, ...]) -> bool:
@@ -108,6 +130,16 @@ READ: dict[str, Mapping[str, Any]] = {
         "learning_rate_schedule": ("constant", "linear"),
         "trunk": ("separate", "shared"),
     },
+    "rejax": {
+        **_ON_DEVICE,
+        "env_kwargs": _ANY,
+        "value_hidden": _ANY,
+        "normalize_observations": _ANY,
+        "normalize_rewards": _ANY,
+        "hidden": _ANY,
+        "activation": ACTIVATIONS,
+    },
+    "purejaxrl": {**_ON_DEVICE, "hidden": ((64, 64),), "activation": ("tanh", "relu")},
 }
 # What a peer has nothing of, and is measured without, whatever we train with.
 LACKS: dict[str, tuple[str, ...]] = {
@@ -123,12 +155,14 @@ LACKS: dict[str, tuple[str, ...]] = {
     ),
     "rl_games": ("clip_observations", "clip_rewards"),
 }
+GYMNAX_PEERS = ("rejax", "purejaxrl")  # they have environments on the device, and no others
 _LEARNING = ("task", "learning", "network", "normalisation")
 _COSTLESS = ("rescale_actions",)  # a multiplication of each action, or none
-# What a preset may differ in from the defaults, and what of it a peer does by itself.
+# What a preset or a peer may differ in from the defaults, and what of it a peer does by itself.
 _ALONE: dict[str, dict[str, Any]] = {
     "a2c": {"optimizer": "rmsprop", "trunk": "separate"},
     "atari": {"trunk": "shared", "sign_rewards": True},
+    "purejaxrl": {"normalize_observations": False, "normalize_rewards": False},
 }
 
 
@@ -149,7 +183,13 @@ def peer_settings(peer: str, config: Config) -> dict[str, Any]:
         atari and config.algorithm != "ppo"
     ):
         raise BadInput(f"against: {peer} is run with PPO, not with {config.algorithm}")
-    alone = {**_ALONE.get(config.algorithm, {}), **(_ALONE["atari"] if atari else {})}
+    if peer in GYMNAX_PEERS and not config.env.startswith("gymnax/"):
+        raise BadInput(f"against: {peer} cannot train {config.env}; it has gymnax's environments")
+    alone = {
+        **_ALONE.get(config.algorithm, {}),
+        **(_ALONE["atari"] if atari else {}),
+        **_ALONE.get(peer, {}),
+    }
     for name, known in read.items():
         value = getattr(config, name)
         if known is not _ANY and not (known(value) if callable(known) else value in known):

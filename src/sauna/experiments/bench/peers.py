@@ -19,10 +19,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sauna.experiments.bench.peer_settings import GYMNAX_PEERS
 from sauna.system.errors import BadInput, SaunaError
 
-# What each peer needs beside PyTorch. CleanRL is a script, of which the user names a copy. RLtools
-# finds Intel's MKL by itself; without it, it looks for another BLAS.
+_WITH_JAX = ["jax[cpu]==0.10.2", "distrax==0.1.9", "gymnax==0.0.9"]
+# What each peer needs, beside PyTorch where it is not in JAX. CleanRL and PureJaxRL are scripts, of
+# which the user names a copy. Both in JAX read five values of a step, and gymnax 1 returns six.
+# RLtools finds Intel's MKL by itself; without it, it looks for another BLAS.
 PEERS = {
     "sb3": [
         "stable-baselines3==2.9.2",
@@ -37,8 +40,9 @@ PEERS = {
         *(f"{name}; platform_machine == 'x86_64'" for name in ("mkl", "mkl-include")),
     ],
     "rl_games": ["rl_games==1.6.5", "envpool==1.2.5"],
+    "rejax": ["rejax==0.1.3", *_WITH_JAX],
+    "purejaxrl": ["flax", "optax", *_WITH_JAX],
 }
-_WITHOUT_TORCH = ("rltools",)
 # CPU builds of PyTorch have an index of their own; the default one brings gigabytes of CUDA.
 _TORCH = (
     ["torch", "--index-url", "https://download.pytorch.org/whl/cpu"],
@@ -65,7 +69,7 @@ def prepare(peer: str, say: Callable[[str], None]) -> Path:
     done, wanted = folder / "complete", " ".join(PEERS[peer])
     failed = None
     if not done.exists():
-        torch = () if peer in _WITHOUT_TORCH else _TORCH
+        torch = () if peer in (*GYMNAX_PEERS, "rltools") else _TORCH
         also = " and PyTorch (CPU)" if torch else ""
         say(f"installing {PEERS[peer][0]}{also} into {folder}, once")
         venv.create(folder, with_pip=True, clear=True)
@@ -100,13 +104,18 @@ def peer_rate(
     """Returns env steps per second, summed over `processes` trainings that run at the same time.
 
     Args:
-      script: CleanRL's `ppo_continuous_action.py`; None for another peer.
+      script: CleanRL's `ppo_continuous_action.py` or PureJaxRL's `ppo.py`; None for another peer.
       settings: what `peer_settings` gives.
 
     Raises:
       SaunaError: one of them failed; its last line says why.
     """
-    measure = partial(_own, peer) if script is None else partial(_cleanrl, script)
+    if peer in GYMNAX_PEERS:
+        settings = {**settings, "peer": peer, "script": str(script.resolve()) if script else None}
+    if peer == "cleanrl" and script is not None:
+        measure = partial(_cleanrl, script)
+    else:
+        measure = partial(_own, peer)
     with ThreadPoolExecutor(processes) as pool:
         each = ({**settings, "seed": seed, "seconds": seconds} for seed in range(processes))
         return sum(pool.map(lambda one: measure(python, one), each))
@@ -120,7 +129,7 @@ def _variables() -> dict[str, str]:
 
 def _own(peer: str, python: Path, settings: Mapping[str, Any]) -> float:
     """The rate that `peer_NAME.py` prints as JSON on its last line."""
-    script = Path(__file__).with_name(f"peer_{peer}.py")
+    script = Path(__file__).with_name(f"peer_{'jax' if peer in GYMNAX_PEERS else peer}.py")
     command = [str(python), str(script), json.dumps({**settings, "folder": os.getcwd()})]
     with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it is started
         done = subprocess.run(command, capture_output=True, text=True, env=_variables(), cwd=folder)
@@ -169,6 +178,7 @@ def versions(python: Path) -> dict[str, str]:
         "import importlib.metadata as m, json; "
         "names = {d.name for d in m.distributions()}; "
         "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy', "
+        "'rejax', 'jax', 'jaxlib', 'flax', 'optax', 'distrax', 'gymnax', "
         "'rltools', 'mkl', 'rl-games', 'envpool'); "
         "print(json.dumps({n: m.version(n) for n in wanted if n in names}))"
     )
