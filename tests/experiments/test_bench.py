@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
 import time
 from pathlib import Path
@@ -119,6 +120,20 @@ def test_the_report_shows_every_figure() -> None:
         (["--against", "sb3", "--preset", "a2c"], "trunk: not read by sb3, which has separate"),
         (["ALE/Pong-v5", "--against", "sb3"], "trunk: not read by sb3, which has shared"),
         (["ALE/Pong-v5", "--against", "sb3", "--preset", "a2c-atari"], "sb3 is run with PPO"),
+        (["--against", "rltools", "--hidden", "64,32"], "hidden: rltools has no (64, 32)"),
+        (["--against", "rltools", "--activation", "elu"], "activation: rltools has no elu"),
+        (
+            ["--against", "rltools", "--trunk", "shared"],
+            "trunk: not read by rltools, which has sep",
+        ),
+        (["CartPole-v1", "--against", "rltools"], "env: rltools has no CartPole-v1"),
+        (["CartPole-v1", "--against", "rl_games"], "env: rl_games has no CartPole-v1"),
+        (["--against", "rl_games", "--warmup", "0.1"], "warmup: not read by rl_games"),
+        (["--against", "rl_games", "--preset", "a2c"], "rl_games is run with PPO, not with a2c"),
+        (
+            ["--against", "rl_games", "--env-kwargs", '{"forward_reward_weight": 2}'],
+            "env_kwargs: not read by rl_games",
+        ),
         (["--rounds", "0"], "rounds: must be"),
         (["NoSuch-v0"], "unknown environment"),
         (["--json", "nowhere/x.json"], "is not a folder"),
@@ -164,6 +179,90 @@ def test_a_script_with_numbers_of_its_own_gets_the_environment_alone() -> None:
     assert peer_settings("cleanrl", resolve({"env": "Hopper-v5"})) == {"env": "Hopper-v5"}
     with pytest.raises(BadInput, match="envs: not read by cleanrl, which has 1"):
         peer_settings("cleanrl", resolve({"env": "Hopper-v5", "envs": 4}))
+
+
+def test_what_a_peer_lacks_may_have_any_value() -> None:
+    for given in ({}, {"normalize_rewards": False, "max_grad_norm": 9.0}):
+        found = peer_settings("rltools", resolve({"env": "HalfCheetah-v5", **given}))
+        assert not {"normalize_rewards", "max_grad_norm"} & found.keys()
+    with pytest.raises(BadInput, match="max_grad_norm: not read by cleanrl"):
+        peer_settings("cleanrl", resolve({"env": "HalfCheetah-v5", "max_grad_norm": 9.0}))
+
+
+def run_script(peer: str, monkeypatch, folder: Path, capsys, **overrides) -> float:
+    """Runs `peer_NAME.py` in this process, with whatever stands for the peer's modules."""
+    settings = peer_settings(peer, resolve({"env": "InvertedPendulum-v5", **overrides}))
+    text = json.dumps({**settings, "seed": 3, "seconds": 0.0, "folder": "."})
+    monkeypatch.setattr(sys, "argv", ["script", text])
+    monkeypatch.setattr(sys, "prefix", str(folder))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")
+    runpy.run_path(str(Path(command.__file__).with_name(f"peer_{peer}.py")))
+    return json.loads(capsys.readouterr().out.splitlines()[-1])["rate"]
+
+
+def test_rltools_is_compiled_with_the_settings_of_the_run(tmp_path, monkeypatch, capsys) -> None:
+    made: list[dict] = []
+    seeds: list[int] = []
+
+    def compiled(make_env, **constants):
+        box = make_env().action_space  # of this task it is -3 to 3, which RLtools refuses
+        made.append({**constants, "bounds": (box.low.item(), box.high.item())})
+        return SimpleNamespace(State=lambda seed: seeds.append(seed) or SimpleNamespace(step=int))
+
+    monkeypatch.setitem(sys.modules, "rltools", SimpleNamespace(PPO=compiled))
+    given = {"envs": 4, "rollout_steps": 64, "minibatches": 8, "hidden": "32,32,32"}
+    assert run_script("rltools", monkeypatch, tmp_path, capsys, **given) > 0
+    run_script("rltools", monkeypatch, tmp_path, capsys, **given, activation="relu")
+    first, second = made
+    sizes = ("N_ENVIRONMENTS", "ON_POLICY_RUNNER_STEPS_PER_ENV", "BATCH_SIZE", "N_EPOCHS")
+    assert [first[name] for name in sizes] == [4, 64, 32, 10]
+    assert (first["ACTOR_NUM_LAYERS"], first["CRITIC_HIDDEN_DIM"]) == (4, 32)
+    activations = (first["ACTOR_ACTIVATION_FUNCTION"], second["CRITIC_ACTIVATION_FUNCTION"])
+    assert activations == ("FAST_TANH", "RELU")
+    assert (first["INITIAL_ACTION_STD"], first["bounds"], seeds) == (1.0, (-1.0, 1.0), [3, 3])
+    assert first["interface_name"] != second["interface_name"]
+
+
+def test_rl_games_is_configured_with_the_settings_of_the_run(tmp_path, monkeypatch, capsys) -> None:
+    loaded: list[dict] = []
+
+    class Runner:
+        def __init__(self, observer) -> None:
+            self.observer = observer
+
+        def load(self, config) -> None:
+            loaded.append(config["params"])
+
+        def run(self, arguments) -> None:
+            for epoch in range(1, 100):
+                self.observer.after_print_stats(256 * epoch, epoch, 0.0)
+            raise AssertionError("it was not ended")
+
+    names = SimpleNamespace(list_all_envs=lambda: ["InvertedPendulum-v5"], __version__="1")
+    for name, module in {
+        "envpool": names,
+        "torch": SimpleNamespace(set_num_threads=int),
+        "rl_games.common.algo_observer": SimpleNamespace(AlgoObserver=object),
+        "rl_games.torch_runner": SimpleNamespace(Runner=Runner),
+    }.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    given = {"envs": 4, "rollout_steps": 64, "minibatches": 8, "activation": "silu"}
+    assert run_script("rl_games", monkeypatch, tmp_path, capsys, **given) > 0
+    (found,) = loaded
+    learning = found["config"]
+    sizes = ("num_actors", "horizon_length", "minibatch_size", "mini_epochs")
+    assert [learning[name] for name in sizes] == [4, 64, 32, 10]
+    assert (learning["lr_schedule"], learning["normalize_input"]) == ("linear", True)
+    assert (found["network"]["separate"], found["torch_threads"]) == (True, 1)
+    assert found["network"]["mlp"]["activation"] == "swish"
+    assert learning["env_config"] == {
+        "env_name": "InvertedPendulum-v5",
+        "seed": 4,
+        "num_threads": 1,
+    }
+    names.list_all_envs = list
+    with pytest.raises(SystemExit, match="EnvPool 1 has no InvertedPendulum-v5"):
+        run_script("rl_games", monkeypatch, tmp_path, capsys, **given)
 
 
 MINATAR = {"env": "gymnax/Breakout-MinAtar", "arm": "ppo", "preset": "minatar"}

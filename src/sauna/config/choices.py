@@ -32,7 +32,7 @@ NETWORKS = ("auto", "mlp", "nature-cnn", "small-cnn", "impala-cnn")
 OPTIMIZERS = ("adam", "rmsprop", "adamw", "sgd", "lion", "nadam", "radam", "adabelief", "lamb")
 SCHEDULES = ("constant", "linear", "cosine")
 # Other trainers that `sauna bench --against` knows, and which of them are a script.
-PEERS = ("sb3", "cleanrl", "brax", "rejax", "purejaxrl")
+PEERS = ("sb3", "cleanrl", "rltools", "rl_games", "brax", "rejax", "purejaxrl")
 PEER_SCRIPTS = {"cleanrl": "ppo_continuous_action.py", "purejaxrl": "ppo.py"}
 # What `sauna list` can name.
 LISTS = {

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import plain, resolve
-from sauna.experiments.bench.peer_settings import peer_settings
+from sauna.experiments.bench.peer_settings import LACKS, peer_settings
 from sauna.experiments.bench.peers import peer_rate, prepare, versions
 from sauna.experiments.bench.rates import (
     WARM_UP,
@@ -80,12 +80,16 @@ def bench(
         measures[against] = partial(
             peer_rate, against, python, script, settings, processes, SECONDS
         )
+        lacks = {name: getattr(config, name) for name in LACKS.get(against, ())}
         result["peer"] = {
             "name": against,
             "processes": processes,
             "versions": versions(python),
             "settings": settings,
+            "measured_without": lacks,
         }
+        if lacks:
+            say(f"{against} is measured without {', '.join(lacks)}, which it does not have")
     result["rates"] = rates = alternate(measures, rounds, say)
     result["ratios"] = {
         name: ratio(rates["training"], others)

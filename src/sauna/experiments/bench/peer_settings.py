@@ -7,6 +7,7 @@ from typing import Any
 
 from sauna.config.choices import ACTIVATIONS
 from sauna.config.settings import FIELDS, Config
+from sauna.envs.make import is_mujoco
 from sauna.system.errors import BadInput
 
 _ANY = None
@@ -60,8 +61,15 @@ _ON_DEVICE: Mapping[str, Any] = {
     ),
     "learning_rate_schedule": ("constant", "linear"),
 }
-# Of each peer, the settings of learning that it reads, with the values that it knows. CleanRL's
-# script has numbers of its own: those of preset mujoco, which are our defaults.
+
+
+def _one_width(hidden: tuple[int, ...]) -> bool:
+    return len(hidden) > 0 and len(set(hidden)) == 1
+
+
+# Of each peer, the settings of learning that it reads, with the values that it knows, or a function
+# that says whether it knows one. CleanRL's script has numbers of its own: those of preset mujoco,
+# which are our defaults.
 READ: dict[str, Mapping[str, Any]] = {
     "sb3": {
         **_PPO,
@@ -72,6 +80,56 @@ READ: dict[str, Mapping[str, Any]] = {
         "distribution": ("gaussian", "gsde"),
     },
     "cleanrl": {"env": _ANY},
+    "rltools": {
+        **dict.fromkeys(
+            (
+                "env_kwargs",
+                "envs",
+                "rollout_steps",
+                "minibatches",
+                "epochs",
+                "learning_rate",
+                "clip_range",
+                "normalize_advantages",
+                "entropy_coef",
+                "gamma",
+                "gae_lambda",
+                "log_std_init",
+            ),
+            _ANY,
+        ),
+        "env": is_mujoco,
+        "hidden": _one_width,
+        "activation": ("tanh", "relu", "sigmoid", "gelu"),
+    },
+    "rl_games": {
+        **dict.fromkeys(
+            (
+                "envs",
+                "rollout_steps",
+                "minibatches",
+                "epochs",
+                "learning_rate",
+                "max_grad_norm",
+                "clip_range",
+                "clip_value",
+                "normalize_advantages",
+                "entropy_coef",
+                "value_coef",
+                "gamma",
+                "gae_lambda",
+                "hidden",
+                "log_std_init",
+                "normalize_observations",
+                "normalize_rewards",
+            ),
+            _ANY,
+        ),
+        "env": is_mujoco,
+        "activation": ("tanh", "relu", "elu", "gelu", "selu", "sigmoid", "silu"),
+        "learning_rate_schedule": ("constant", "linear"),
+        "trunk": ("separate", "shared"),
+    },
     "rejax": {
         **_ON_DEVICE,
         "env_kwargs": _ANY,
@@ -82,6 +140,20 @@ READ: dict[str, Mapping[str, Any]] = {
         "activation": ACTIVATIONS,
     },
     "purejaxrl": {**_ON_DEVICE, "hidden": ((64, 64),), "activation": ("tanh", "relu")},
+}
+# What a peer has nothing of, and is measured without, whatever we train with.
+LACKS: dict[str, tuple[str, ...]] = {
+    "rltools": (
+        "learning_rate_schedule",
+        "max_grad_norm",
+        "clip_value",
+        "value_coef",  # it has an optimiser for each network
+        "normalize_observations",
+        "normalize_rewards",
+        "clip_observations",
+        "clip_rewards",
+    ),
+    "rl_games": ("clip_observations", "clip_rewards"),
 }
 GYMNAX_PEERS = ("rejax", "purejaxrl")  # they have environments on the device, and no others
 _LEARNING = ("task", "learning", "network", "normalisation")
@@ -119,11 +191,13 @@ def peer_settings(peer: str, config: Config) -> dict[str, Any]:
         **_ALONE.get(peer, {}),
     }
     for name, known in read.items():
-        if known is not _ANY and getattr(config, name) not in known:
-            raise BadInput(f"{name}: {peer} has no {getattr(config, name)}")
+        value = getattr(config, name)
+        if known is not _ANY and not (known(value) if callable(known) else value in known):
+            raise BadInput(f"{name}: {peer} has no {value}")
+    left_out = (*read, *_COSTLESS, *LACKS.get(peer, ()))
     for name, field in FIELDS.items():
         usual = alone.get(name, field.default)
-        unread = field.metadata["group"] in _LEARNING and name not in (*read, *_COSTLESS)
+        unread = field.metadata["group"] in _LEARNING and name not in left_out
         if unread and getattr(config, name) != usual:
             raise BadInput(f"{name}: not read by {peer}, which has {usual}")
     return {name: getattr(config, name) for name in read}

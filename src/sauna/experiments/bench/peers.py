@@ -25,6 +25,7 @@ from sauna.system.errors import BadInput, SaunaError
 _WITH_JAX = ["jax[cpu]==0.10.2", "distrax==0.1.9", "gymnax==0.0.9"]
 # What each peer needs, beside PyTorch where it is not in JAX. CleanRL and PureJaxRL are scripts, of
 # which the user names a copy. Both in JAX read five values of a step, and gymnax 1 returns six.
+# RLtools finds Intel's MKL by itself; without it, it looks for another BLAS.
 PEERS = {
     "sb3": [
         "stable-baselines3==2.9.2",
@@ -33,6 +34,12 @@ PEERS = {
         "opencv-python-headless",
     ],
     "cleanrl": ["gymnasium[mujoco]", "tyro", "tensorboard"],
+    "rltools": [
+        "rltools==2.2.1",
+        "gymnasium[mujoco]",
+        *(f"{name}; platform_machine == 'x86_64'" for name in ("mkl", "mkl-include")),
+    ],
+    "rl_games": ["rl_games==1.6.5", "envpool==1.2.5"],
     "rejax": ["rejax==0.1.3", *_WITH_JAX],
     "purejaxrl": ["flax", "optax", *_WITH_JAX],
 }
@@ -62,7 +69,7 @@ def prepare(peer: str, say: Callable[[str], None]) -> Path:
     done, wanted = folder / "complete", " ".join(PEERS[peer])
     failed = None
     if not done.exists():
-        torch = () if peer in GYMNAX_PEERS else _TORCH
+        torch = () if peer in (*GYMNAX_PEERS, "rltools") else _TORCH
         also = " and PyTorch (CPU)" if torch else ""
         say(f"installing {PEERS[peer][0]}{also} into {folder}, once")
         venv.create(folder, with_pip=True, clear=True)
@@ -171,7 +178,8 @@ def versions(python: Path) -> dict[str, str]:
         "import importlib.metadata as m, json; "
         "names = {d.name for d in m.distributions()}; "
         "wanted = ('stable_baselines3', 'torch', 'gymnasium', 'mujoco', 'ale-py', 'numpy', "
-        "'rejax', 'jax', 'jaxlib', 'flax', 'optax', 'distrax', 'gymnax'); "
+        "'rejax', 'jax', 'jaxlib', 'flax', 'optax', 'distrax', 'gymnax', "
+        "'rltools', 'mkl', 'rl-games', 'envpool'); "
         "print(json.dumps({n: m.version(n) for n in wanted if n in names}))"
     )
     command = [str(python), "-c", code]
