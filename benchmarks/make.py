@@ -21,6 +21,9 @@ from sauna.experiments.bench.scale import draw
 from sauna.system import run_directory
 
 ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "results"))
+from pictures import store  # noqa: E402
+
 RESULTS = ROOT / "benchmarks" / "results"
 MEASURED = {
     "cheetah_6": ["HalfCheetah-v5", "--against", "sb3", "--rounds", "5"],
@@ -53,6 +56,7 @@ _BESIDE = ["--seeds", "2", "--against", "sb3", "--rounds", "5"]
 # Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
 BY_HAND = ["cheetah_1_cleanrl"]
+SHORT = ("cheetah_6", "cheetah_1_cleanrl", "pong_1", "cartpole", "lunar_lander", "own_dict")
 NAMES = {"sb3": "Stable-Baselines3", "cleanrl": "CleanRL's script"}
 FILTERED = {
     "ppo": {"arm": "ppo"},
@@ -162,9 +166,14 @@ def short_table(found: dict[str, dict[str, Any]]) -> str:
             peer = f"{one['ratios'][name]['median']:.1f} x {NAMES[name]}"
         lines.append(
             f"| {one['env']} | {one['members']}, {one['processes']} | "
-            f"{rates[len(rates) // 2]:,.0f} | {one['ratios']['physics']['median']:.0%} | {peer} |"
+            f"{rates[len(rates) // 2]:,.0f} | {_simulator(one)} | {peer} |"
         )
     return "\n".join(lines)
+
+
+def _simulator(one: dict[str, Any]) -> str:
+    physics = one["ratios"].get("physics")
+    return f"{physics['median']:.0%}" if physics else "-"
 
 
 def _peer(one: dict[str, Any]) -> str:
@@ -178,6 +187,11 @@ def _ratio(one: dict[str, Any], name: str) -> str:
     if ratio is None:
         return "-"
     return f"{ratio['median']:.2f} ({ratio['low']:.2f} to {ratio['high']:.2f})"
+
+
+def measured_on(found: dict[str, dict[str, Any]]) -> str:
+    machine = next(iter(found.values()))["machine"]
+    return f"Measured on: {machine['processor']}, {machine['cores']} cores, {machine['system']}."
 
 
 def split_table(found: dict[str, dict[str, Any]]) -> str:
@@ -236,13 +250,12 @@ def main() -> None:
     if "--measure" in sys.argv:
         measure(sys.argv[sys.argv.index("--measure") + 1 :])
     found = stored([*MEASURED, *BY_HAND])
-    insert(ROOT / "README.md", "speed", short_table(found))
+    insert(ROOT / "README.md", "speed", short_table(stored(SHORT)))
     page = ROOT / "docs" / "concepts" / "performance.md"
-    machine = next(iter(found.values()))["machine"]
-    text = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
-    insert(page, "machine", f"Measured on: {text}.")
+    insert(page, "machine", measured_on(found))
     insert(page, "rates", rates_table(found))
-    insert(page, "others", others_table(stored(OTHERS)))
+    others = stored(OTHERS)
+    insert(page, "others", f"{measured_on(others)}\n\n{others_table(others)}")
     insert(page, "split", split_table(found))
     filtered = RESULTS / "filtered.json"
     if filtered.exists():
@@ -252,11 +265,9 @@ def main() -> None:
     if scaled.exists():
         result = json.loads(scaled.read_text())
         insert(page, "scale", scale_table(result))
-        draw(
-            result["scale"],
-            f"{result['env']}, PPO, whole training",
-            ROOT / "docs" / "images" / "scale.png",
-        )
+        picture = ROOT / "docs" / "images" / "scale.png"
+        draw(result["scale"], f"{result['env']}, PPO, whole training", picture)
+        store(picture, picture)
 
 
 if __name__ == "__main__":
