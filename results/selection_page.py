@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -111,10 +112,15 @@ def screen_answer() -> str | None:
     better = [f"`{label}`" for label, found in words.items() if "better" in found.values()]
     worse = [label for label, found in words.items() if "worse" in found.values()]
     part = f", in part on {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""
+    gains = (
+        f"better than `ppo` by their intervals: {', '.join(better)}"
+        if better
+        else ("no rule is better than `ppo` by its interval")
+    )
+    losses = f"worse on at least one: {len(worse)} of {len(words)} rules"
     return (
-        f"**not decided**: screened with 5 seeds on {len(whole)} of {len(planned)} tasks{part}; by "
-        f"its interval {', '.join(better) or 'no rule'} is better than `ppo` on one of them at "
-        f"least, and {len(worse)} of {len(words)} rules are worse on one at least"
+        f"**not decided**: screened with 5 seeds on {len(whole)} of {len(planned)} tasks{part}; "
+        f"{gains}; {losses}"
     )
 
 
@@ -142,7 +148,8 @@ def difference_interval(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Computes Welch's 95% interval of the difference of two means."""
     if np.ptp(x) == np.ptp(y) == 0:
         return (float(x.mean() - y.mean()),) * 2
-    result = scipy.stats.ttest_ind(x, y, equal_var=False)
+    with warnings.catch_warnings(action="ignore"):  # SciPy's, of seeds that hardly differ
+        result = scipy.stats.ttest_ind(x, y, equal_var=False)
     limits = result.confidence_interval(QUANTILES[1] - QUANTILES[0])
     return float(limits.low), float(limits.high)
 

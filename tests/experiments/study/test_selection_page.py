@@ -107,5 +107,7 @@ def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(selection_page, "load", found.get)
     answer = selection_page.screen_answer()
     assert answer is not None
-    assert "on 1 of 8 tasks, in part on 1 more; by its interval `high` is better" in answer
-    assert "1 of 2 rules are worse" in answer
+    assert (
+        "on 1 of 8 tasks, in part on 1 more; better than `ppo` by their intervals: `high`" in answer
+    )
+    assert "worse on at least one: 1 of 2 rules" in answer
