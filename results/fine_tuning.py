@@ -59,6 +59,7 @@ def flags_of(arm: Arm) -> tuple[str, ...]:
         own = ("--env-kwargs", json.dumps({"forward_reward_weight": arm.trained_on}))
     if arm.start:
         own = (*own, "--init-from", str(run_of(ARMS[arm.start]).relative_to(ROOT)))
+    own = (*own, "--out", str(run_of(arm).relative_to(ROOT)))
     return (ENV, "--arm", "ppo", "--seeds", str(SEEDS), "--steps", str(STEPS), *own)
 
 
@@ -71,7 +72,7 @@ def measure(arm: Arm) -> dict[str, Any]:
     run = run_of(arm)
     if not run_directory.is_complete(run):
         begun = (run / "config.json").exists()
-        how = ("resume", str(run)) if begun else ("train", *flags_of(arm), "--out", str(run))
+        how = ("resume", str(run)) if begun else ("train", *flags_of(arm))
         if code := sauna(*how):
             sys.exit(code)
     reward = {"forward_reward_weight": arm.evaluated_on}
