@@ -135,6 +135,7 @@ def test_folders_are_made_here_or_where_the_user_said() -> None:
         "system/checkpoint.py",  # a temporary name that cannot be guessed
         "system/run_directory.py",  # --out
         "config/trust.py",  # the folder of this user's key
+        "experiments/bench/peer_rltools.py",  # inside the peer's own environment
         "experiments/study/command.py",  # --out
         "experiments/study/existing.py",
         "experiments/study/report.py",
