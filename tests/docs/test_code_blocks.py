@@ -254,7 +254,8 @@ def toy(arguments: list[str]) -> list[str]:
         start = {**{n: f.default for n, f in FIELDS.items()}, **PRESETS[preset]}
         rollout = int(values.get("rollout_steps", start["rollout_steps"]))
         rollout *= int(values.get("envs", start["envs"]))
-        return [*arguments, "--steps", str(2 * rollout), "--seeds", "2"]
+        seeds = [] if "seed" in values else ["--seeds", "2"]
+        return [*arguments, "--steps", str(2 * rollout), *seeds]
     if parsed.command == "eval":
         return [a for a in arguments if a != "--video"] + ["--episodes", "1"]
     return arguments
