@@ -13,7 +13,7 @@ from sauna.system.errors import BadInput
 
 MIN_MINIBATCH = 2  # samples; of fewer, nothing can be standardised
 SMALL_MINIBATCH = 16  # samples; below, a run says so
-FEW_UPDATES = 10  # below which a training is said to be short
+FEW_UPDATES = 10  # a training of fewer gets a note
 LEFT_OVER = 0.05  # share of the budget that fills no rollout, from which it is named
 
 
@@ -298,7 +298,7 @@ def own_parts(config: Config) -> list[str]:
 def budget_note(config: Config) -> str:
     """Says how much of a small budget is trained, in whole rollouts; empty if nothing is worth it.
 
-    A filter's rollouts have no fixed number of env steps: nothing is said of them.
+    A filter's rollouts have no fixed number of env steps, so that there is no note of them.
     """
     rollout = config.rollout_steps * config.envs
     updates = config.steps // rollout

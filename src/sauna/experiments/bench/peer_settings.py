@@ -11,56 +11,29 @@ from sauna.envs.make import is_mujoco
 from sauna.system.errors import BadInput
 
 _ANY = None
-_PPO: Mapping[str, Any] = dict.fromkeys(
-    (
-        "env",
-        "env_kwargs",
-        "envs",
-        "rollout_steps",
-        "minibatches",
-        "epochs",
-        "learning_rate",
-        "max_grad_norm",
-        "clip_range",
-        "clip_value",
-        "normalize_advantages",
-        "entropy_coef",
-        "value_coef",
-        "gamma",
-        "gae_lambda",
-        "hidden",
-        "value_hidden",
-        "normalize_observations",
-        "normalize_rewards",
-        "clip_observations",
-        "clip_rewards",
-        "log_std_init",
-        "sde_sample_freq",
-        "sde_expln",
-    ),
-    _ANY,
+
+
+def _any(*names: str) -> dict[str, Any]:
+    return dict.fromkeys(names, _ANY)
+
+
+# What every peer reads, but CleanRL's script.
+_ALL = _any(
+    "envs",
+    "rollout_steps",
+    "minibatches",
+    "epochs",
+    "learning_rate",
+    "clip_range",
+    "entropy_coef",
+    "gamma",
+    "gae_lambda",
 )
-# What both trainers of gymnax's environments read.
-_ON_DEVICE: Mapping[str, Any] = {
-    **dict.fromkeys(
-        (
-            "env",
-            "envs",
-            "rollout_steps",
-            "minibatches",
-            "epochs",
-            "learning_rate",
-            "max_grad_norm",
-            "clip_range",
-            "entropy_coef",
-            "value_coef",
-            "gamma",
-            "gae_lambda",
-        ),
-        _ANY,
-    ),
-    "learning_rate_schedule": ("constant", "linear"),
-}
+_LOSS = _any("max_grad_norm", "value_coef")
+_HOST = _any("normalize_advantages", "log_std_init")
+_SCALED = _any("normalize_observations", "normalize_rewards")
+_SCHEDULES = {"learning_rate_schedule": ("constant", "linear")}
+_ACTIVATIONS = {"activation": ("tanh", "relu", "elu", "gelu", "selu", "sigmoid", "silu")}
 
 
 def _one_width(hidden: tuple[int, ...]) -> bool:
@@ -72,74 +45,54 @@ def _one_width(hidden: tuple[int, ...]) -> bool:
 # which are our defaults.
 READ: dict[str, Mapping[str, Any]] = {
     "sb3": {
-        **_PPO,
+        **_ALL,
+        **_LOSS,
+        **_HOST,
+        **_SCALED,
+        **_SCHEDULES,
+        **_ACTIVATIONS,
+        **_any("env", "env_kwargs", "clip_value", "hidden", "value_hidden"),
+        **_any("clip_observations", "clip_rewards", "sde_sample_freq", "sde_expln"),
         "algorithm": ("ppo", "a2c"),
-        "learning_rate_schedule": ("constant", "linear"),
         "clip_range_schedule": ("constant", "linear"),
-        "activation": ("tanh", "relu", "elu", "gelu", "selu", "sigmoid", "silu"),
         "distribution": ("gaussian", "gsde"),
     },
-    "cleanrl": {"env": _ANY},
+    "cleanrl": _any("env"),
     "rltools": {
-        **dict.fromkeys(
-            (
-                "env_kwargs",
-                "envs",
-                "rollout_steps",
-                "minibatches",
-                "epochs",
-                "learning_rate",
-                "clip_range",
-                "normalize_advantages",
-                "entropy_coef",
-                "gamma",
-                "gae_lambda",
-                "log_std_init",
-            ),
-            _ANY,
-        ),
+        **_ALL,
+        **_HOST,
+        **_any("env_kwargs"),
         "env": is_mujoco,
         "hidden": _one_width,
         "activation": ("tanh", "relu", "sigmoid", "gelu"),
     },
     "rl_games": {
-        **dict.fromkeys(
-            (
-                "envs",
-                "rollout_steps",
-                "minibatches",
-                "epochs",
-                "learning_rate",
-                "max_grad_norm",
-                "clip_range",
-                "clip_value",
-                "normalize_advantages",
-                "entropy_coef",
-                "value_coef",
-                "gamma",
-                "gae_lambda",
-                "hidden",
-                "log_std_init",
-                "normalize_observations",
-                "normalize_rewards",
-            ),
-            _ANY,
-        ),
+        **_ALL,
+        **_LOSS,
+        **_HOST,
+        **_SCALED,
+        **_SCHEDULES,
+        **_ACTIVATIONS,
+        **_any("clip_value", "hidden"),
         "env": is_mujoco,
-        "activation": ("tanh", "relu", "elu", "gelu", "selu", "sigmoid", "silu"),
-        "learning_rate_schedule": ("constant", "linear"),
         "trunk": ("separate", "shared"),
     },
     "rejax": {
-        **_ON_DEVICE,
-        "env_kwargs": _ANY,
-        "value_hidden": _ANY,
-        "normalize_observations": _ANY,
-        "normalize_rewards": _ANY,
-        "hidden": _ANY,
+        **_ALL,
+        **_LOSS,
+        **_SCALED,
+        **_SCHEDULES,
+        **_any("env", "env_kwargs", "hidden", "value_hidden"),
         "activation": ACTIVATIONS,
     },
-    "purejaxrl": {**_ON_DEVICE, "hidden": ((64, 64),), "activation": ("tanh", "relu")},
+    "purejaxrl": {
+        **_ALL,
+        **_LOSS,
+        **_SCHEDULES,
+        **_any("env"),
+        "hidden": ((64, 64),),
+        "activation": ("tanh", "relu"),
+    },
 }
 # What a peer has nothing of, and is measured without, whatever we train with.
 LACKS: dict[str, tuple[str, ...]] = {

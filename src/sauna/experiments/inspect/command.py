@@ -56,9 +56,7 @@ def inspect(
     run = Path.cwd() / run  # an environment may go elsewhere
     if episodes < 1 or seed < 0 or max_steps < 1:
         raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
-    stored = run_directory.read_config(
-        run, needed=()
-    )  # an exported policy does not know how it learned
+    stored = run_directory.read_config(run, needed=())  # an exported policy knows no training
     artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)
     mode = "deterministic" if deterministic else "sampled"

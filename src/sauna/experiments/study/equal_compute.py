@@ -16,9 +16,9 @@ ABOUT = (
     "reaches the baseline's mean final return, as a multiple of what the baseline itself takes "
     "until then: 0.5 is half of it. Compute is counted in samples that pass through the gradient, "
     "in CPU seconds of the learner, and in CPU seconds of the training, which are those of "
-    "collecting as well. On the device the two cannot be told apart. The interval is a percentile "
-    "bootstrap over seeds, too narrow with few of them; no verdict rests on it. Nothing is said if "
-    "the baseline has one seed, or if its return has not risen by more than its noise. "
+    "collecting as well. On the device the two are one program. The interval is a percentile "
+    "bootstrap over seeds, too narrow with few of them; no verdict rests on it. There is no ratio "
+    "if the baseline has one seed, or if its return has not risen by more than its noise. "
     "CPU seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
 WORDS = {
