@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import shutil
 import subprocess
@@ -207,3 +208,13 @@ def test_a_stored_run_names_the_rules_of_each_of_its_arms() -> None:
     keys = {"sauna rule sauna"}
     assert set(rule_sources.rule_sources(to_stored(run))) == keys
     assert set(rule_sources.rule_sources({"arm": ["ppo", "sauna"]})) == keys
+
+
+def test_a_source_is_written_alike_by_every_python() -> None:
+    """Newer versions give a function's tree a list of type parameters, which is empty here."""
+    returned = ["Return", ["value", ["Constant", ["value", "1"]]]]
+    function = [["name", "'f'"], ["args", ["arguments"]], ["body", [returned]]]
+    assert rule_sources._plain(ast.parse("def f(): return 1")) == [
+        "Module",
+        ["body", [["FunctionDef", *function]]],
+    ]

@@ -102,11 +102,19 @@ def _imports(file: Path) -> Iterator[Path]:
 
 @lru_cache(64)
 def _statements(file: Path, changed: int) -> str:
-    """A source without its comments and docstrings."""
+    """A source without its comments and docstrings, in the same words for every Python."""
     tree = ast.parse(file.read_bytes())
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(
             node, clean=False
         ):
             node.body = node.body[1:] or [ast.Pass()]
-    return ast.unparse(tree)
+    return repr(_plain(tree))
+
+
+def _plain(node: Any) -> Any:
+    """A syntax tree as lists. `ast.unparse` and `ast.dump` differ between versions of Python."""
+    if isinstance(node, ast.AST):
+        fields = ((name, value) for name, value in ast.iter_fields(node) if value not in (None, []))
+        return [type(node).__name__, *([name, _plain(value)] for name, value in fields)]
+    return [*map(_plain, node)] if isinstance(node, list) else repr(node)
