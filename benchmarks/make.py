@@ -1,7 +1,7 @@
 """Makes the tables of speed and the figure of scale from `benchmarks/results/`.
 
 python benchmarks/make.py                      tables and figure from the result files
-python benchmarks/make.py --measure            measures first (about an hour on an idle machine)
+python benchmarks/make.py --measure            measures first (two hours on an idle machine)
 python benchmarks/make.py --measure NAME ...   measures these result files alone
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -42,22 +43,58 @@ MEASURED = {
         "10",
     ],
 }
-# Environments written in Python, and wide networks: one seed per core.
+# Environments written in Python, and wide networks: one seed per core. BipedalWalker's preset has
+# twice as many environments and steps, which would take an hour.
+_WALKER = ["BipedalWalker-v3", "--preset", "auto", "--envs", "16", "--rollout-steps", "1024"]
 OTHERS = {
     "cartpole": ["CartPole-v1", "--preset", "auto", "--iterations", "400"],
     "lunar_lander": ["LunarLander-v3", "--preset", "auto", "--iterations", "8"],
-    "bipedal_walker": ["BipedalWalker-v3", "--preset", "auto", "--iterations", "2"],
+    "bipedal_walker": [*_WALKER, "--iterations", "6"],
     "own_dict": ["own_envs:Reach"],
     "own_slow": ["own_envs:Reach", "--env-kwargs", '{"milliseconds": 1}', "--iterations", "3"],
     "cheetah_256": ["HalfCheetah-v5", "--hidden", "256,256", "--iterations", "12"],
     "cheetah_512": ["HalfCheetah-v5", "--hidden", "512,256,128", "--iterations", "6"],
 }
 _BESIDE = ["--seeds", "2", "--against", "sb3", "--rounds", "5"]
+# Peers that are known as fast: one seed, one thread. rl_games trains with the numbers of its own
+# `mujoco/halfcheetah_envpool.yaml`.
+RL_GAMES = shlex.split(
+    "--envs 64 --rollout-steps 256 --minibatches 8 --epochs 5 --hidden 128,64,32 --activation elu "
+    "--trunk shared --learning-rate 5e-4 --no-clip-value --max-grad-norm 1 --value-coef 4"
+)
+_GYMNAX = ["--preset", "minatar", "--seeds", "1", "--rounds", "5"]
+_POLE = ["gymnax/CartPole-v1", *_GYMNAX, "--iterations", "100"]
+_BREAKOUT = ["gymnax/Breakout-MinAtar", *_GYMNAX, "--iterations", "60"]
+FAST = {
+    "cheetah_rltools": ["HalfCheetah-v5", "--seeds", "1", "--rounds", "5", "--against", "rltools"],
+    "cheetah_rl_games": [
+        "HalfCheetah-v5",
+        "--seeds",
+        "1",
+        "--rounds",
+        "5",
+        *RL_GAMES,
+        "--against",
+        "rl_games",
+    ],
+    "pole_rejax": [*_POLE, "--against", "rejax"],
+    "breakout_rejax": [*_BREAKOUT, "--against", "rejax"],
+    # These two need a copy of PureJaxRL's folder: `PUREJAXRL=FOLDER python benchmarks/make.py ...`.
+    "pole_purejaxrl": [*_POLE, "--against", "purejaxrl"],
+    "breakout_purejaxrl": [*_BREAKOUT, "--against", "purejaxrl"],
+}
 # Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
 BY_HAND = ["cheetah_1_cleanrl"]
 SHORT = ("cheetah_6", "cheetah_1_cleanrl", "pong_1", "cartpole", "lunar_lander", "own_dict")
-NAMES = {"sb3": "Stable-Baselines3", "cleanrl": "CleanRL's script"}
+NAMES = {
+    "sb3": "Stable-Baselines3",
+    "cleanrl": "CleanRL's script",
+    "rltools": "RLtools (C++)",
+    "rl_games": "rl_games + EnvPool",
+    "rejax": "rejax",
+    "purejaxrl": "PureJaxRL's script",
+}
 FILTERED = {
     "ppo": {"arm": "ppo"},
     "sauna, threshold 0.8": {"arm": "sauna", "threshold": 0.8},
@@ -70,6 +107,7 @@ def measure(names: Sequence[str]) -> None:
     flags = {
         **MEASURED,
         **{name: [*own, *_BESIDE] for name, own in OTHERS.items()},
+        **FAST,
         "scale": ["--scale"],
     }
     for name in names or (*flags, "filtered"):
@@ -77,6 +115,8 @@ def measure(names: Sequence[str]) -> None:
             measure_filtered()
             continue
         command = [sys.executable, "-m", "sauna", "bench", *flags[name]]
+        if name.endswith("purejaxrl"):
+            command += ["--script", str(Path(os.environ["PUREJAXRL"]) / "ppo.py")]
         file = str(RESULTS / f"{name}.json")
         subprocess.run([*command, "--json", file], check=True, cwd=ROOT / "benchmarks")
 
@@ -115,13 +155,13 @@ def stored(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     }
 
 
-def others_table(found: dict[str, dict[str, Any]]) -> str:
-    """Beside another trainer with the same settings, and what the environment takes of our time."""
+def others_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
+    """Beside another trainer with the same settings, and what bounds the ratio."""
     lines = [
-        "| PPO on | envs x steps, epochs, network | env steps/s, in sum | of another trainer | the environment's share of our time |",  # noqa: E501
-        "|---|---|---|---|---|",
+        "| PPO on | envs x steps, epochs, network | env steps/s, in sum | of another trainer | the environment's share of our time | no trainer can exceed |",  # noqa: E501
+        "|---|---|---|---|---|---|",
     ]
-    for one in found.values():
+    for name, one in found.items():
         rates, own = sorted(one["rates"]["training"]), one["peer"]["settings"]
         env = one["env"] + (", 1 ms a step" if "milliseconds" in own["env_kwargs"] else "")
         network = "-".join(map(str, own["hidden"]))
@@ -129,8 +169,79 @@ def others_table(found: dict[str, dict[str, Any]]) -> str:
         lines.append(
             f"| {env} | {own['envs']} x {own['rollout_steps']}, {own['epochs']}, {network} | "
             f"{rates[len(rates) // 2]:,.0f} | {_peer(one)} | "
-            f"{stepping / sum(one['split'].values()):.0%} |"
+            f"{stepping / sum(one['split'].values()):.0%} | {most_over_peer(name, one, peak):.1f} |"
         )
+    return "\n".join(lines)
+
+
+def most_over_peer(name: str, one: dict[str, Any], peak: dict[str, Any]) -> float:
+    """The ratio over the peer of a trainer that only steps the environment and multiplies the
+    update's matrices at this machine's peak."""
+    gflops = max(network["peak_gflops"] for network in peak["networks"])
+    products = peak["operations_of_an_env_step"][name] / (1e3 * gflops)
+    least = one["split"]["environment"] + one["split"]["physics"] + products
+    peer = sorted(one["rates"][one["peer"]["name"]])
+    return 1e6 * one["processes"] / (peer[len(peer) // 2] * least)
+
+
+def fast_table(found: dict[str, dict[str, Any]]) -> str:
+    """Beside peers that are known as fast, with what they are measured without."""
+    lines = [
+        "| peer | PPO on | envs x steps, minibatches, epochs, network | env steps/s: ours, theirs | ratio | measured without |",  # noqa: E501
+        "|---|---|---|---|---|---|",
+    ]
+    for one in found.values():
+        peer, own = one["peer"], one["peer"]["settings"]
+        ours = sorted(one["rates"].get("training") or one["rates"]["whole"])
+        theirs = sorted(one["rates"][peer["name"]])
+        version = peer["versions"].get(peer["name"].replace("_", "-"), "")
+        without = ", ".join(map(_named, peer.get("measured_without", ()))) or "-"
+        lines.append(
+            f"| {NAMES[peer['name']]} {version}".rstrip() + f" | {one['env']} | "
+            f"{own['envs']} x {own['rollout_steps']}, {own['minibatches']}, {own['epochs']}, "
+            f"{'-'.join(map(str, own['hidden']))} | {_middle(ours)}, {_middle(theirs)} | "
+            f"{_ratio(one, peer['name'])} | {without} |"
+        )
+    return "\n".join(lines)
+
+
+def _named(field: str) -> str:
+    return f"`{field}`"
+
+
+def _middle(rates: Sequence[float]) -> str:
+    return f"{rates[len(rates) // 2]:,.0f}"
+
+
+def peak_table(peak: dict[str, Any]) -> str:
+    """How close an update comes to the machine's peak."""
+    lines = [
+        "| network | operations of a sample, thousands | peak, GFLOP/s | the update, of the peak | its products alone, of the peak |",  # noqa: E501
+        "|---|---|---|---|---|",
+    ]
+    for one in peak["networks"]:
+        lines.append(
+            f"| {'-'.join(map(str, one['hidden']))} | {one['operations_of_a_sample'] / 1e3:.0f} | "
+            f"{one['peak_gflops']:.0f} | {one['update_of_peak']:.2f} | "
+            f"{one['products_of_peak']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def startup_table(result: dict[str, Any]) -> str:
+    """Seconds from the command, median and range."""
+    lines = [
+        "| one seed | cold: first env step, first row | warm: first env step, first row |",
+        "|---|---|---|",
+    ]
+    for name, starts in result["starts"].items():
+        cells = []
+        for kind in ("cold", "warm"):
+            moments = [sorted(values) for values in zip(*starts[kind], strict=True)]
+            cells.append(
+                ", ".join(f"{v[len(v) // 2]:.1f} s ({v[0]:.1f} to {v[-1]:.1f})" for v in moments)
+            )
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -255,7 +366,12 @@ def main() -> None:
     insert(page, "machine", measured_on(found))
     insert(page, "rates", rates_table(found))
     others = stored(OTHERS)
-    insert(page, "others", f"{measured_on(others)}\n\n{others_table(others)}")
+    peak = json.loads((RESULTS / "peak.json").read_text())
+    insert(page, "others", f"{measured_on(others)}\n\n{others_table(others, peak)}")
+    insert(page, "peak", peak_table(peak))
+    if fast := stored(FAST):
+        insert(page, "fast", f"{measured_on(fast)}\n\n{fast_table(fast)}")
+    insert(page, "startup", startup_table(json.loads((RESULTS / "startup.json").read_text())))
     insert(page, "split", split_table(found))
     filtered = RESULTS / "filtered.json"
     if filtered.exists():

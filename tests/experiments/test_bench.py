@@ -25,8 +25,20 @@ POLE = "gymnax/CartPole-v1"
 
 def test_the_rate_leaves_out_the_warm_up() -> None:
     clock = Clock()
-    clock.seen = [(0.0, 0, 10), (50.0, 1, 20), (52.0, 2, 30), (53.0, 3, 40), (57.0, 4, 80)]
+    clock.seen["a"] = [(0.0, 0, 10), (50.0, 1, 20), (52.0, 2, 30), (53.0, 3, 40), (57.0, 4, 80)]
     assert clock.rate() == (80 - 20) / (57 - 50)
+
+
+def test_the_rate_of_two_processes_is_the_sum_of_both(monkeypatch) -> None:
+    """Each makes 10 env steps a second; one is always half a second behind."""
+    clock = Clock()
+    clock.open(resolve({"env": "x"}), [SimpleNamespace(name=name) for name in "ab"], Path(), [])
+    for iteration in range(5):
+        for name, late in (("a", 0.0), ("b", 0.5)):
+            monkeypatch.setattr(time, "perf_counter", lambda t=iteration + late: t)
+            row = {"member": name, "iteration": iteration, "env_steps": 10 * (iteration + 1)}
+            clock.rows([row])
+    assert clock.rate() == pytest.approx(20.0)
 
 
 def test_ratios_are_of_neighbouring_rounds() -> None:

@@ -33,8 +33,9 @@ class Clock:
     """A display that shows nothing and notes when each iteration's rows arrive."""
 
     def __init__(self) -> None:
-        self.seen: list[tuple[float, int, int]] = []  # (time, iteration, env steps in all)
-        self._steps: dict[str, int] = {}
+        self.seen: dict[
+            str, list[tuple[float, int, int]]
+        ] = {}  # member: time, iteration, env steps
         self.started = time.perf_counter()
 
     def say(self, text: str) -> None:
@@ -43,15 +44,15 @@ class Clock:
     def open(
         self, config: Config, members: list[Member], path: Path, rows: list[dict[str, Any]]
     ) -> None:
-        self._steps = {member.name: 0 for member in members}
+        self.seen = {member.name: [] for member in members}
 
     def phase(self, process: int, text: str) -> None:
         pass
 
     def rows(self, rows: list[dict[str, Any]]) -> None:
-        self._steps |= {row["member"]: row["env_steps"] for row in rows}
-        last = rows[-1]["iteration"]
-        self.seen.append((time.perf_counter(), last, sum(self._steps.values())))
+        now = time.perf_counter()
+        for row in rows:
+            self.seen[row["member"]].append((now, row["iteration"], row["env_steps"]))
 
     def refresh(self) -> None:
         pass
@@ -63,12 +64,20 @@ class Clock:
         pass
 
     def rate(self) -> float:
-        """Returns env steps per second of all members after the warm-up, to the last row."""
-        warm = [entry for entry in self.seen if entry[1] >= WARM_UP - 1]
-        if len(warm) < 2:
-            raise SaunaError("too few iterations to measure a rate")
-        (first, _, before), (last, _, after) = warm[0], warm[-1]
-        return (after - before) / (last - first)
+        """Returns env steps per second, each member's from its own warm-up to its own last row, in
+        sum.
+
+        A common start would count an iteration of one process that began before it.
+        """
+        return sum(map(_rate_of_a_member, self.seen.values()))
+
+
+def _rate_of_a_member(seen: list[tuple[float, int, int]]) -> float:
+    warm = [entry for entry in seen if entry[1] >= WARM_UP - 1]
+    if len(warm) < 2:
+        raise SaunaError("too few iterations to measure a rate")
+    (first, _, before), (last, _, after) = warm[0], warm[-1]
+    return (after - before) / (last - first)
 
 
 def training_rate(settings: Mapping[str, Any]) -> float:
