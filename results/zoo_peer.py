@@ -25,8 +25,17 @@ if s["normalize_observations"] or s["normalize_rewards"]:
         norm_reward=s["normalize_rewards"],
         gamma=s["gamma"],
     )
-rate = s["learning_rate"]
-is_linear = s["learning_rate_schedule"] == "linear"
+
+
+def over_the_budget(name: str) -> object:
+    """A setting as a number, or as what SB3 calls with the share of the budget that is left."""
+    value, schedule = s[name], s[f"{name}_schedule"]
+    if schedule not in ("constant", "linear"):
+        raise SystemExit(f"{name}_schedule: not known here: {schedule}")
+    return (lambda left: value * left) if schedule == "linear" else value
+
+
+clip = over_the_budget("clip_range")
 model = PPO(
     "MlpPolicy",
     vector,
@@ -35,12 +44,12 @@ model = PPO(
     n_epochs=s["epochs"],
     gamma=s["gamma"],
     gae_lambda=s["gae_lambda"],
-    clip_range=s["clip_range"],
-    clip_range_vf=s["clip_range"] if s["clip_value"] else None,
+    clip_range=clip,
+    clip_range_vf=clip if s["clip_value"] else None,
     ent_coef=s["entropy_coef"],
     vf_coef=s["value_coef"] / 2,  # our value loss has the factor 0.5 inside
     max_grad_norm=s["max_grad_norm"],
-    learning_rate=(lambda left: rate * left) if is_linear else rate,
+    learning_rate=over_the_budget("learning_rate"),
     policy_kwargs={"log_std_init": s["log_std_init"]},
     seed=s["seed"],
     device="cpu",
