@@ -242,6 +242,8 @@ def startup_table(result: dict[str, Any]) -> str:
                 ", ".join(f"{v[len(v) // 2]:.1f} s ({v[0]:.1f} to {v[-1]:.1f})" for v in moments)
             )
         lines.append(f"| {name} | {' | '.join(cells)} |")
+    imports = sorted(result["import_seconds"])
+    lines += ["", f"`import sauna` takes {imports[len(imports) // 2]:.2f} s."]
     return "\n".join(lines)
 
 
