@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from clone_page import clone_text
+from exports_page import exports_text
 from measured_pages import fine_tuning_page, noise_page, posture_page, sweep_page
 from pictures import store
 from selection_page import CURVES as SELECTION_CURVES
@@ -252,6 +253,8 @@ def write_pages() -> None:
     if clones := load("clone"):
         text = clone_text(clones["tasks"])
         insert(ROOT / "docs" / "how-to" / "record_and_clone.md", "clone", text)
+    if exported := load("exports"):
+        insert(ROOT / "docs" / "how-to" / "deploy.md", "exports", exports_text(exported))
     if tuned := load("tune"):
         insert(ROOT / "docs" / "how-to" / "tune.md", "tune", tune_text(tuned))
     if results := load("pong"):

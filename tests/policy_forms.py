@@ -17,6 +17,7 @@ from helpers import configured
 from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.normalize import Moments
 from sauna.algorithm.policy.policy import Policy
+from sauna.envs.masked import MASK, MaskedSpace
 from sauna.envs.spaces import describe
 from sauna.experiments.share.graph import Graph
 from sauna.experiments.share.numpy_file import to_numpy
@@ -57,9 +58,14 @@ def _random_params(policy: Policy, random: np.random.Generator) -> np.ndarray:
 
 
 def sampled(space: Any, number: int) -> list[Any]:
-    """As many random observations."""
+    """As many random observations; a mask leaves each component of the action a choice."""
     space.seed(0)
-    return [space.sample() for _ in range(number)]
+    found = [space.sample() for _ in range(number)]
+    if isinstance(space, MaskedSpace):
+        starts = np.cumsum((0, *space.sizes))[:-1]
+        for mask in (one[MASK] for one in found):
+            mask[starts[np.maximum.reduceat(mask, starts) == 0]] = 1
+    return found
 
 
 def numpy_file(graph: Graph, folder: Path) -> Callable[[Any], Any]:

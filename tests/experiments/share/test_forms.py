@@ -18,75 +18,34 @@ from gymnasium import spaces as gym
 
 from helpers import configured
 from policy_forms import made, numpy_file, sampled
+from policy_kinds import BOX, VECTORS
 from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.config.choices import ACTIVATIONS
-from sauna.envs.masked import MaskedSpace
 from sauna.experiments.share.graph import Graph
 from sauna.experiments.share.layers_graph import activated
 from sauna.experiments.share.numpy_file import to_numpy
 from sauna.experiments.share.onnx_file import to_onnx
 from sauna.experiments.share.policy_graph import policy_graph
-from sauna.experiments.share.same import check_same, numpy_policy, onnx_policy
+from sauna.experiments.share.same import check_same, numpy_policy, onnx_policy, stacked
 from sauna.system.errors import BadInput, SaunaError
 
 MANY = 1000  # observations
-INF = np.inf
-BOX = gym.Box(-INF, INF, (5,))
-BOUNDED = gym.Box(np.array([-2, -INF, 0], np.float32), np.array([3, INF, 0.5], np.float32))
-FINITE = gym.Box(np.array([-2, 1], np.float32), np.array([3, 1.5], np.float32))
-NESTED = gym.Dict(
-    {
-        "b": gym.Box(-1, 1, (2, 2), np.float64),
-        "a": gym.Tuple([gym.Discrete(3, start=-1), gym.MultiDiscrete([2, 3])]),
-        "it's": gym.MultiBinary(2),
-    }
-)
-# Each kind of observation, network and action at least once: (observations, actions, settings).
-KINDS: dict[str, tuple[Any, Any, dict[str, Any]]] = {
-    "normalised, tanh, clipped": (BOX, gym.Box(-0.3, 0.3, (2,)), {"normalize": True}),
-    "stretched": (BOX, BOUNDED, {"rescale_actions": True, "activation": "relu"}),
-    "float64, shaped box": (
-        gym.Box(-1, 1, (2, 3), np.float64),
-        gym.Box(-0.3, 0.3, (1, 2), np.float64),
-        {"normalize": True, "trunk": "shared"},
-    ),
-    "squashed": (BOX, FINITE, {"distribution": "squashed", "rescale_actions": True}),
-    "beta": (BOX, FINITE, {"distribution": "beta", "rescale_actions": True}),
-    "gelu, layer norm": (
-        BOX,
-        FINITE,
-        {"hidden": (8,), "activation": "gelu", "layer_norm": True},
-    ),
-    "masked": (
-        MaskedSpace(BOX, gym.MultiDiscrete([2, 4])),
-        gym.MultiDiscrete([2, 4]),
-        {"normalize": True, "action_mask": True},
-    ),
-    "lstm": (BOX, FINITE, {"recurrent": "lstm", "recurrent_width": 4, "normalize": True}),
-    "gru": (
-        gym.Discrete(4),
-        gym.Discrete(3),
-        {"recurrent": "gru", "recurrent_width": 4, "trunk": "shared"},
-    ),
-    "one choice": (gym.Discrete(4), gym.Discrete(3, start=2), {"hidden": (8,)}),
-    "nested, choices": (NESTED, gym.MultiDiscrete([2, 4]), {"normalize": True}),
-    "bits": (gym.MultiDiscrete([3, 2]), gym.MultiBinary(3), {}),
-    "board, flattened": (gym.Box(0, 4, (3, 3, 2), np.uint8), gym.Discrete(4), {}),
-}
 
 
 @cache
 def policy_of(kind: str) -> tuple[FrozenPolicy, Graph, Any]:
     """A policy with random weights, the graph of it, and its observation space."""
-    policy, graph = made(*KINDS[kind])
-    return policy, graph, KINDS[kind][0]
+    policy, graph = made(*VECTORS[kind])
+    return policy, graph, VECTORS[kind][0]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", VECTORS)
 def test_numpy_acts_as_the_policy(kind: str, tmp_path: Path) -> None:
     policy, graph, space = policy_of(kind)
     act, seen = numpy_file(graph, tmp_path), sampled(space, MANY)
     check_same("numpy", policy, act, seen)
+    policy.reset()
+    assert len(np.unique(policy(stacked(seen)), axis=0)) > 1  # or nothing would be compared
     policy.reset()
     one = numpy_policy(tmp_path / "policy.py", graph)(seen[0])
     expected = policy(seen[0])
@@ -106,7 +65,7 @@ def test_each_activation_is_flaxs(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", VECTORS)
 def test_onnx_acts_as_the_policy(kind: str) -> None:
     pytest.importorskip("onnxruntime", reason="needs `pip install 'sauna-rl[onnx]'`")
     policy, graph, space = policy_of(kind)
