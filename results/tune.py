@@ -1,7 +1,7 @@
 """Two searches by `sauna tune` from a poor start, and populations beside random searches.
 
     python results/tune.py              trains what is missing under runs/, then writes the numbers
-    python results/tune.py --collect    writes `results/tune.json` from what runs/ holds
+    python results/tune.py --collect    adds what runs/ holds to `results/tune.json`
 
 On a shared core the whole takes about two hours.
 """
@@ -12,6 +12,8 @@ import json
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,8 @@ SEARCHES = {
     "Pendulum-v1": f"{START} --envs 4 --steps 1e5",
     "LunarLander-v3": f"{START} --envs 16 --rollout-steps 256 --steps 3e5",
 }
-OF_SEARCH = "--trials 40 --lockstep 8"
+TRIALS, MEMBERS = 40, 8
+OF_SEARCH = f"--trials {TRIALS} --lockstep 8"
 SPACE = """
 learning_rate = {low = 1e-5, high = 1e-2, log = true}
 clip_range = [0.1, 0.2, 0.3, 0.4]
@@ -34,7 +37,7 @@ max_grad_norm = [0.3, 0.5, 1.0, 2.0, 5.0]
 SEEDS = range(3)
 EQUAL = (
     f"Pendulum-v1 {START} --envs 4 --rollout-steps 128 --minibatches 4 --epochs 5 --steps 4e4 "
-    "--trials 8 --finalists 1 --fresh-seeds 0 --space runs/traced.toml"
+    f"--trials {MEMBERS} --finalists 1 --fresh-seeds 0 --space runs/traced.toml"
 )
 KINDS = {
     "population": "--population-based --exchange-every 4096",
@@ -53,23 +56,46 @@ def commands() -> dict[str, str]:
     return found
 
 
-def collect() -> dict[str, Any]:
-    """Reads what the folders under runs/ hold, found by their settings."""
-    searches: dict[str, Any] = {}
-    equal: dict[str, dict[str, Any]] = {kind: {} for kind in KINDS}
-    for path in Path("runs").glob("tune_*/results.json"):
-        found = json.loads(path.read_text())
+def collect(stored: Mapping[str, Any], runs: Path) -> dict[str, Any]:
+    """Adds what the tunings in a folder have found to what is stored.
+
+    A stored part stays, with its command, unless the folder has one that was finished later. A
+    tuning that has not ended is left out.
+    """
+    searches = dict(stored.get("searches", {}))
+    equal = {kind: dict(stored.get("equal_steps", {}).get(kind, {})) for kind in KINDS}
+    held = {*searches, *(f"{kind} {seed}" for kind, parts in equal.items() for seed in parts)}
+    typed = commands() | {name: stored["commands"][name] for name in held}
+    for path in sorted(runs.glob("tune_*/results.json"), key=finished):
+        found, when = json.loads(path.read_text()), finished(path)
         plan = found["tune"]
         if "rollout_steps" in plan["values"]:
-            searches[found["env"]] = search(found, path.parent)
+            name = command = found["env"]
+            parts, part = searches, search(found, path.parent)
+            has_ended = len(part["trials"]) >= TRIALS and part["verdict"]["believed"] is not None
         else:
-            kind = "population" if plan["exchange_every"] else "random"
-            equal[kind][str(plan["seeds"][0])] = {
-                "returns": [trial["return"] for trial in found["trials"]],
-                "env_steps": found["env_steps"]["trials"],
-                "exchanges": len(found["exchanges"]),
-            }
-    return {"commands": commands(), "searches": searches, "equal_steps": equal}
+            kind, name = "population" if plan["exchange_every"] else "random", str(plan["seeds"][0])
+            command = f"{kind} {name}"
+            parts, part = equal[kind], of_equal(found)
+            has_ended = len(part["returns"]) >= MEMBERS and None not in part["returns"]
+        if has_ended and when > parts.get(name, {}).get("finished", ""):
+            parts[name] = {**part, "finished": when}
+            typed[command] = found["command"]
+    return {"commands": typed, "searches": searches, "equal_steps": equal}
+
+
+def of_equal(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Keeps of a population, or of a search with as many env steps, what the page shows."""
+    return {
+        "returns": [trial["return"] for trial in found["trials"]],
+        "env_steps": found["env_steps"]["trials"],
+        "exchanges": len(found["exchanges"]),
+    }
+
+
+def finished(results: Path) -> str:
+    """When a tuning wrote its results last, in UTC."""
+    return datetime.fromtimestamp(results.stat().st_mtime, UTC).isoformat(timespec="seconds")
 
 
 def search(found: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -108,7 +134,8 @@ def main() -> None:
         for command in commands().values():
             subprocess.run([sys.executable, "-m", *shlex.split(command)], check=True)
     path = ROOT / "results" / "tune.json"
-    path.write_text(json.dumps(collect(), indent=1, sort_keys=True) + "\n")
+    found = collect(json.loads(path.read_text()) if path.exists() else {}, Path("runs"))
+    path.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

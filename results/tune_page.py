@@ -66,7 +66,19 @@ def _equal(runs: Mapping[str, Mapping[str, Any]]) -> str:
         best = ", ".join(f"{max(own):.0f}" for own in returns)
         mean = ", ".join(f"{np.mean(own):.0f}" for own in returns)
         rows.append(f"| {words} | {best} | {mean} |")
-    return head + "\n\n" + "\n".join(rows)
+    said = ", and ".join(
+        f"the {name} return of its eight in {_compared(runs, seeds, of)}"
+        for name, of in (("best", max), ("mean", np.mean))
+    )
+    return f"{head}\n\n" + "\n".join(rows) + f"\n\nThe population lost on {said} repetitions."
+
+
+def _compared(runs: Mapping[str, Mapping[str, Any]], seeds: Sequence[str], of: Any) -> str:
+    """In how many repetitions the population's return is the lower one, as `3 of 3`."""
+    pairs = [
+        [of(runs[kind][seed]["returns"]) for kind in ("population", "random")] for seed in seeds
+    ]
+    return f"{sum(population < random for population, random in pairs)} of {len(pairs)}"
 
 
 def _spread(values: Sequence[int]) -> str:
