@@ -66,6 +66,17 @@ class Open(Good):
     action_space = gym.Box(-np.inf, np.inf, (1,), np.float32)
 
 
+class Boundless(Good):
+    """One number of three has no bounds."""
+
+    observation_space = gym.Dict(
+        {"point": gym.Box(np.array([-100, -np.inf], np.float32), 100), "time": gym.Box(0, 20, (1,))}
+    )
+
+    def seen(self) -> Any:
+        return {"point": self.point.copy(), "time": np.array([self.left], np.float32)}
+
+
 class Large(Good):
     reward = 1e5
 
@@ -157,6 +168,15 @@ def test_what_is_wrong_is_named(env: type, kind: str, text: str) -> None:
     findings = found(env)
     assert [k for k, said in findings if text in said] == [kind], findings
     assert findings == sorted(findings, key=lambda finding: finding[0] != WRONG)
+
+
+def test_observations_without_bounds_are_a_note_on_what_a_training_does() -> None:
+    result = check(name_of(Boundless), {}, 60)
+    note = "1 of 3 numbers observed have no bounds: a training normalises them by what it has seen"
+    assert note in result.facts and result.findings == []
+    (said,) = [fact for fact in check("CartPole-v1", {}, 60).facts if "no bounds" in fact]
+    assert said.startswith("2 of 4 numbers") and "preset cartpole takes them as they are" in said
+    assert not [fact for fact in check(name_of(Good), {}, 60).facts if "no bounds" in fact]
 
 
 @pytest.mark.parametrize("steps", [100, 300, 2000])

@@ -11,12 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.config.settings import parse
+from sauna.config.presets import resolve
+from sauna.config.settings import Config, parse
+from sauna.config.zoo import AUTO, entry_of
 from sauna.envs.host.answers import close
 from sauna.envs.host.together import group_size
 from sauna.envs.make import is_native, make_env
 from sauna.envs.masked import MaskedEnv, mask_method
 from sauna.envs.probe import probe
+from sauna.envs.shapes import leaves
 from sauna.envs.spaces import MAX_BOUND, describe
 from sauna.envs.wrapping import PLAIN, Wrapping
 from sauna.experiments.check.played import Played, play
@@ -66,6 +69,7 @@ def check(env: str, env_kwargs: Mapping[str, Any] | str, steps: int) -> Checked:
     made = make_env(env, kwargs)
     facts = [f"observations: {made.observation_space}", f"actions: {made.action_space}"]
     try:
+        facts += _without_bounds(env, made.observation_space)
         findings = list(_of_spaces(made))
         played, wrapping = _with_masks(made)
         if not is_native(env, kwargs) and group_size(made) is None and played is made:
@@ -76,6 +80,29 @@ def check(env: str, env_kwargs: Mapping[str, Any] | str, steps: int) -> Checked:
     finally:
         close(made)
     return Checked(facts, sorted(findings, key=lambda finding: finding.kind != WRONG))
+
+
+def _without_bounds(env: str, space: Any) -> list[str]:
+    """Says what a training does about observations without bounds."""
+    from gymnasium import spaces as gym
+
+    boxes = [part for _, part in leaves(space) if isinstance(part, gym.Box)]
+    open_ = sum(int(_open(box).sum()) for box in boxes)
+    if not open_:
+        return []
+    config = resolve({"env": env, "preset": AUTO if entry_of(env) else Config.preset})
+    said = f"{open_} of {sum(box.low.size for box in boxes)} numbers observed have no bounds"
+    if config.normalize_observations:
+        return [f"{said}: a training normalises them by what it has seen"]
+    return [
+        f"{said}, and preset {config.preset} takes them as they are; if they grow large, give "
+        "--normalize-observations"
+    ]
+
+
+def _open(box: Any) -> np.ndarray:
+    """Which components of a Box lack a bound."""
+    return ~((box.low > -MAX_BOUND) & (box.high < MAX_BOUND))
 
 
 def _with_masks(env: Any) -> tuple[Any, Wrapping]:
@@ -94,7 +121,7 @@ def _of_spaces(env: Any) -> Iterator[Finding]:
         yield Finding(WRONG, str(error), FIRST)
     action = env.action_space
     if isinstance(action, gym.Box):
-        open_ = ~((action.low > -MAX_BOUND) & (action.high < MAX_BOUND))
+        open_ = _open(action)
         if open_.any():
             yield Finding(
                 WARNING,
