@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from wsgiref.util import setup_testing_defaults
 
 import numpy as np
 import pytest
@@ -59,6 +60,43 @@ def test_a_trial_is_a_member_and_trains_as_it_would_alone(whole, tmp_path: Path)
     (member,) = alone.summary.values()
     assert member["return_mean"] == best["return"]
     assert sum(t["env_steps"] for t in found["trials"]) == found["env_steps"]["trials"] == 4 * 128
+
+
+def test_the_file_that_was_found_trains_from_the_command_line(whole, tmp_path: Path) -> None:
+    found, folder = whole
+    out = tmp_path / "run"
+    file = str(folder / "tuned.json")
+    done = sauna_here(
+        "train", "--config", file, "--seeds", "1", "--processes", "1", "--out", str(out)
+    )
+    assert done.returncode == 0, done.stderr
+    (member,) = json.loads((out / "summary.json").read_text())["members"].values()
+    assert member["return_mean"] == found["best"]["return"]
+
+
+@pytest.mark.slow
+def test_optunas_dashboard_shows_the_trials(whole) -> None:
+    dashboard = pytest.importorskip("optuna_dashboard", reason="needs `sauna-rl[tune]`")
+    from optuna.storages.journal import JournalFileBackend, JournalStorage
+
+    found, folder = whole
+    app = dashboard.wsgi(JournalStorage(JournalFileBackend(str(folder / storage.FILE))))
+    (study,) = asked(app, "/api/studies")["study_summaries"]
+    assert study["study_name"] == storage.NAME
+    shown = asked(app, f"/api/studies/{study['study_id']}")["trials"]
+    assert [(t["number"], t["state"].lower()) for t in shown] == [(n, "complete") for n in range(4)]
+    values = [float(trial["values"][0]) for trial in shown]
+    assert values == [trial["return"] for trial in found["trials"]]
+
+
+def asked(app: Callable[..., Any], path: str) -> Any:
+    """What a WSGI application says at an address of its API."""
+    request: dict[str, Any] = {"PATH_INFO": path, "QUERY_STRING": "after=0"}
+    setup_testing_defaults(request)
+    said: list[str] = []
+    body = b"".join(app(request, lambda status, headers, exc_info=None: said.append(status)))
+    assert said[0].startswith("200"), body
+    return json.loads(body)
 
 
 def test_the_first_trial_has_the_settings_that_all_start_from(whole) -> None:
