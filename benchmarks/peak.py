@@ -136,6 +136,7 @@ def measure(hidden: str, rounds: int) -> dict[str, Any]:
     done = of_a_sample * samples
     return {
         "hidden": list(config.hidden),
+        "gradient_steps": config.epochs * config.minibatches,
         "samples_of_a_minibatch": config.envs * config.rollout_steps // config.minibatches,
         "operations_of_a_sample": of_a_sample,
         "peak_gflops": peak / 1e9,

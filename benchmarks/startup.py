@@ -4,7 +4,8 @@
 
 The time runs from the command `sauna train` to the first env step, and to the first row of metrics,
 with one seed. *Cold* begins with empty caches, as the first run after an installation does. *Warm*
-is a second run of the same settings: what XLA and Numba compiled is read from their caches.
+is a second run of the same settings: what XLA and Numba compiled is read from their caches. `import
+sauna` is timed by itself, in new interpreters.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -46,6 +49,12 @@ def measure(settings: dict[str, Any], rounds: int) -> dict[str, list[list[float]
     return found
 
 
+def import_seconds(rounds: int) -> list[float]:
+    code = "import time; t = time.perf_counter(); import sauna; print(time.perf_counter() - t)"
+    command = [sys.executable, "-c", code]
+    return [float(subprocess.check_output(command, text=True)) for _ in range(rounds)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--rounds", type=int, default=5)
@@ -53,6 +62,7 @@ def main() -> None:
     result: dict[str, Any] = {
         "machine": run_directory.machine(),
         "versions": run_directory.versions(),
+        "import_seconds": import_seconds(rounds),
         "moments": MOMENTS,
         "starts": {},
     }

@@ -209,11 +209,12 @@ def posture_answer(measured: Mapping[str, Any]) -> str:
 
 def fine_tuning_page(found: Mapping[str, Any]) -> str:
     """What a run that starts from the weights of another gains, `results/fine_tuning.json`."""
-    rows = [["Training", "Return of each seed", "Mean", "Mean episode length"]]
+    rows = [["Training", "Return of each seed", "Mean", "Length", "Speed of each seed, m/s"]]
     for arm, unit in found["arms"].items():
         shown = ", ".join(f"{value:,.0f}" for value in unit["returns"])
+        speeds = ", ".join(f"{value:.2f}" for value in unit["speeds"])
         mean, length = np.mean(unit["returns"]), np.mean(unit["lengths"])
-        rows.append([arm, shown, f"{mean:,.0f}", f"{length:,.0f}"])
+        rows.append([arm, shown, f"{mean:,.0f}", f"{length:,.0f}", speeds])
     return page(
         "fine_tuning",
         steps=f"{found['steps']:,}",

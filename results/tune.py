@@ -18,8 +18,8 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset's
 SEARCHES = {
-    "Pendulum-v1": f"{START} --envs 4 --steps 4e4",
-    "LunarLander-v3": f"{START} --envs 16 --rollout-steps 256 --steps 3e4",
+    "Pendulum-v1": f"{START} --envs 4 --steps 1e5",
+    "LunarLander-v3": f"{START} --envs 16 --rollout-steps 256 --steps 3e5",
 }
 OF_SEARCH = "--trials 40 --lockstep 8"
 SPACE = """

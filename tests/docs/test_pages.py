@@ -40,11 +40,14 @@ def test_the_docs_stay_small() -> None:
 
 def test_each_of_our_cells_beside_other_libraries_has_a_recipe_and_a_test() -> None:
     page = (DOCS / "start" / "libraries.md").read_text()
-    rows = [line.split(" | ") for line in page.splitlines() if line.count(" | ") == 8]
-    ours = [(cells[1], cells[2].strip("` ")) for cells in rows if cells[1] not in ("SAUNA", "---")]
-    assert len(ours) > 25
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| ")]
+    ours = [(row[1], row[-1].strip("`")) for row in rows if len(row) == 9]
+    assert len(ours) > 45
     for cell, test in ours:
-        assert cell == "no" or (re.search(r"]\(\.\./[\w/-]+\.md", cell) and (ROOT / test).is_file())
+        recipe = re.search(r"]\((\.\./[\w/-]+\.md)", cell)
+        assert (cell, test) == ("no", "-") or recipe, cell
+        assert test == "-" or (ROOT / "tests" / test).is_file(), test
+        assert recipe is None or (DOCS / "start" / recipe[1]).is_file(), cell
 
 
 def test_every_page_is_in_the_navigation() -> None:

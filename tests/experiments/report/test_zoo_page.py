@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from zoo import TRAINED, is_done, settings_of, stored
-from zoo_page import draw_zoo, zoo_page
+from zoo import LEFT_OUT, TRAINED, is_done, plan_of, settings_of, stored
+from zoo_page import WORDS, draw_zoo, is_below, zoo_page
 
-from sauna.config.zoo import ENVS, entry_of
+from sauna.config.zoo import ENVS, PUBLISHED, entry_of
 
 
 def unit(*returns: float) -> dict[str, Any]:
@@ -35,12 +35,28 @@ def test_a_row_holds_the_seeds_their_mean_and_the_published_return() -> None:
     assert page.index("Not trained here yet") < page.index("| `LunarLanderContinuous-v3`")
 
 
-def test_below_is_a_mean_lower_than_the_published_one_by_more_than_the_larger_spread() -> None:
+def test_below_is_a_mean_lower_than_the_published_one_by_more_than_the_published_spread() -> None:
     assert "None so far." in below({"LunarLander-v3": unit(211.0, 211.0, 211.0)})
     assert "not explained yet" in below({"LunarLander-v3": unit(209.0, 209.0, 209.0)})
-    assert "None so far." in below({"LunarLander-v3": unit(209.0, 109.0, 309.0)})
+    assert "not explained yet" in below({"LunarLander-v3": unit(209.0, 109.0, 309.0)})
     assert "0.9999" in below({"Swimmer-v5": unit(100.0, 101.0, 102.0)})
+    assert "returns 1.000, 1.000." in below({"MiniGrid-Unlock-v0": unit(0.9, 0.8)})  # sampled
     assert "None so far." in below({"Humanoid-v5": unit(1.0, 1.0, 1.0)})  # nothing is published
+
+
+def test_each_stored_return_below_the_published_one_has_a_word() -> None:
+    """If this fails, say in `WORDS` of `results/zoo_page.py` why these are below."""
+    without = [env for env, found in stored().items() if is_below(env, found) and env not in WORDS]
+    assert without == []
+    assert set(WORDS) <= set(PUBLISHED) & set(ENVS)
+
+
+def test_each_environment_waits_for_its_turn_or_is_left_out_for_a_reason() -> None:
+    left_out = [env for env in ENVS if plan_of(env) in LEFT_OUT.values()]
+    assert set(left_out) == set(ENVS) - set(TRAINED) and len(TRAINED) == len(set(TRAINED))
+    assert {plan_of(env) for env in TRAINED} == {"waits for its turn"}
+    presets = {entry.preset for env in TRAINED if (entry := entry_of(env))}
+    assert "minigrid-long" in presets
 
 
 def test_a_figure_has_a_panel_for_each_environment(tmp_path: Path) -> None:
