@@ -228,6 +228,11 @@ def peak_table(peak: dict[str, Any]) -> str:
             f"{one['peak_gflops']:.0f} | {one['update_of_peak']:.2f} | "
             f"{one['products_of_peak']:.2f} | {1e6 * beyond:.0f} |"
         )
+    cnn, gflops = peak["nature_cnn"], max(one["peak_gflops"] for one in peak["networks"])
+    lines.append(
+        f"| Nature CNN, Pong | {cnn['operations_of_a_sample'] / 1e3:,.0f} | {gflops:.0f} | "
+        f"{cnn['update_of_peak']:.2f} | - | - |"
+    )
     return "\n".join(lines)
 
 

@@ -35,8 +35,9 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from make import OTHERS, RESULTS  # noqa: E402
-from selection import CHEETAH, config_of, least_of_a_block, one_update  # noqa: E402
+from selection import CHEETAH, PONG, config_of, least_of_a_block, one_update  # noqa: E402
 
+from sauna.algorithm.policy.convolutions import LAYERS  # noqa: E402
 from sauna.config.settings import Config  # noqa: E402
 from sauna.envs.spaces import Spaces  # noqa: E402
 from sauna.system import run_directory  # noqa: E402
@@ -63,6 +64,18 @@ def operations(trunks: Sequence[Sequence[int]]) -> int:
         sizes = [a * b for a, b in pairwise(widths)]
         total += 2 * (3 * sum(sizes) - sizes[0])
     return total
+
+
+def convolutions_of(pictures: Spaces) -> int:
+    """Operations of the Nature CNN for one picture, with both heads, counted as in `operations`."""
+    side, channels, sizes = pictures.observation_shape[0], pictures.observation_shape[-1], []
+    for features, width, stride in LAYERS:
+        side = (side - width) // stride + 1
+        sizes.append(side**2 * width**2 * channels * features)
+        channels = features
+    flat = side**2 * channels
+    sizes += [flat * 512, 512 * (sum(pictures.action_sizes) + 1)]
+    return 2 * (3 * sum(sizes) - sizes[0])
 
 
 def products_alone(config: Config, spaces: Spaces) -> Callable[[], float]:
@@ -147,6 +160,20 @@ def measure(hidden: str, rounds: int) -> dict[str, Any]:
     }
 
 
+def measure_cnn(rounds: int, peak: float) -> dict[str, Any]:
+    """The rate of Pong's update, of the peak."""
+    config = config_of({"preset": "atari"}, PONG)
+    update, samples = one_update(config, PONG, False, time.process_time), config.epochs
+    samples *= config.envs * config.rollout_steps
+    seconds = min(least_of_a_block(update) for _ in range(rounds))
+    done = convolutions_of(PONG) * samples
+    return {
+        "operations_of_a_sample": convolutions_of(PONG),
+        "update_seconds": seconds,
+        "update_of_peak": done / seconds / (1e9 * peak),
+    }
+
+
 def operations_of_an_env_step(name: str) -> int:
     """Operations that the update makes for one env step, in the setting of a bench."""
     stored = json.loads((RESULTS / f"{name}.json").read_text())
@@ -163,11 +190,14 @@ def main() -> None:
     rounds = parser.parse_args().rounds
     sys.path.append(str(RESULTS.parent))  # `own_envs`
     measured = [name for name in OTHERS if (RESULTS / f"{name}.json").exists()]
+    networks = [measure(hidden, rounds) for hidden in NETWORKS]
+    peak = max(network["peak_gflops"] for network in networks)
     result = {
         "machine": run_directory.machine(),
         "versions": run_directory.versions(),
         "rounds": rounds,
-        "networks": [measure(hidden, rounds) for hidden in NETWORKS],
+        "networks": networks,
+        "nature_cnn": measure_cnn(rounds, peak),
         "operations_of_an_env_step": {name: operations_of_an_env_step(name) for name in measured},
     }
     PATH.write_text(json.dumps(result, indent=1) + "\n")

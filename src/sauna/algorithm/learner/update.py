@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -160,4 +161,22 @@ def device_minibatch_order(config: Config, key: Array, length: int | None = None
     """
     number = length or units(config)
     keys = jax.random.split(key, config.epochs)
-    return jax.vmap(lambda key: jax.random.permutation(key, number))(keys)
+    return jax.vmap(lambda key: permutation(key, number))(keys)
+
+
+def permutation(key: Array, number: int) -> Array:
+    """Draws what `jax.random.permutation(key, number)` draws, `[number]` int32.
+
+    JAX sorts pairs of a random key and an element, so often that equal keys do not matter. Here
+    both are one 64-bit number: XLA sorts plain numbers four times as fast on a CPU.
+    """
+    order = jnp.arange(number, dtype=jnp.int32)
+    rounds = math.ceil(3 * math.log(max(number, 1)) / math.log(2**32 - 1))
+    for _ in range(rounds):
+        key, own = jax.random.split(key)
+        first = jax.random.bits(own, (number,), jnp.uint32)
+        with jax.enable_x64(True):
+            pairs = first.astype(jnp.uint64) << 32 | jnp.arange(number, dtype=jnp.uint64)
+            places = jnp.sort(pairs, stable=False).astype(jnp.uint32)
+        order = order[places]
+    return order
