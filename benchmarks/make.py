@@ -257,8 +257,8 @@ def startup_table(result: dict[str, Any]) -> str:
 
 def rates_table(found: dict[str, dict[str, Any]]) -> str:
     lines = [
-        "| | env steps/s, in sum | of the simulator alone | of another trainer | first env step | memory of a process |",  # noqa: E501
-        "|---|---|---|---|---|---|",
+        "| | processor | env steps/s, in sum | of the simulator alone | of another trainer | first env step | memory of a process |",  # noqa: E501
+        "|---|---|---|---|---|---|---|",
     ]
     for one in found.values():
         rates = sorted(one["rates"]["training"])
@@ -266,11 +266,15 @@ def rates_table(found: dict[str, dict[str, Any]]) -> str:
         what += "seed" if one["members"] == 1 else "seeds"
         what += f", {one['processes']} process" + ("es" if one["processes"] > 1 else "")
         lines.append(
-            f"| {what} | {rates[len(rates) // 2]:,.0f} | {_ratio(one, 'physics')} | "
-            f"{_peer(one)} | {one['seconds_to_first_env_step']:.1f} s | "
+            f"| {what} | {_processor(one)} | {rates[len(rates) // 2]:,.0f} | "
+            f"{_ratio(one, 'physics')} | {_peer(one)} | {one['seconds_to_first_env_step']:.1f} s | "
             f"{one['peak_memory_mib']:.0f} MiB |"
         )
     return "\n".join(lines)
+
+
+def _processor(one: dict[str, Any]) -> str:
+    return str(one["machine"]["processor"]).replace("(R)", "").replace(" Processor", "")
 
 
 def short_table(found: dict[str, dict[str, Any]]) -> str:
@@ -373,7 +377,6 @@ def main() -> None:
     found = stored([*MEASURED, *BY_HAND])
     insert(ROOT / "README.md", "speed", short_table(stored(SHORT)))
     page = ROOT / "docs" / "concepts" / "performance.md"
-    insert(page, "machine", measured_on(found))
     insert(page, "rates", rates_table(found))
     others = stored(OTHERS)
     peak = json.loads((RESULTS / "peak.json").read_text())

@@ -60,6 +60,21 @@ def _informative_step(state: State, action: jax.Array) -> Transition:
 informative = walk._replace(step=_informative_step)
 
 
+def _twice(observation: jax.Array) -> jax.Array:
+    return jnp.concatenate([observation, observation[:1]])
+
+
+# The same again, with the spaces of `small_envs.Scripted`: the second action does nothing.
+wide = JaxEnv(
+    lambda key: (reset(key)[0], _twice(reset(key)[1])),
+    lambda state, action: (told := step(state, action))._replace(
+        observation=_twice(told.observation)
+    ),
+    gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64),
+    gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32),
+)
+
+
 def make_walk(limit: float = 2.0) -> JaxEnv:
     def near(state: State, action: jax.Array) -> Transition:
         transition = step(state, action)

@@ -139,6 +139,16 @@ class Scripted(SmallEnv):
         return self.cut and self.t >= self.end
 
 
+class Pushed(Scripted):
+    """The same, with the spaces of `jax_envs.walk`."""
+
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def observe(self) -> np.ndarray:
+        return super().observe()[:2].astype(np.float32)
+
+
 class Boxed(Scripted):
     """Actions in a box that is not [-1, 1]; notes what it gets."""
 

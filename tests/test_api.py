@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import jax
@@ -162,8 +163,10 @@ def test_evaluation_does_not_change_the_run_and_repeats(result) -> None:
 
 def test_tensorboard_holds_the_same_numbers(result) -> None:
     from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
 
     found: dict[str, list[float]] = {}
+    others: dict[str, Any] = {}
     for path in (result.path / "tensorboard" / "sauna" / "0").iterdir():
         blob, at = path.read_bytes(), 0
         while at < len(blob):
@@ -171,10 +174,20 @@ def test_tensorboard_holds_the_same_numbers(result) -> None:
             event = Event.FromString(blob[at + 12 : at + 12 + size])
             for value in event.summary.value:
                 found.setdefault(value.tag, []).append(value.simple_value)
+                others[value.tag] = value
             at += 12 + size + 4
     rows = [row for row in result.metrics if row["member"] == "sauna/0"]
     for name in ("keep_rate", "vex_mean", "entropy", "kept_steps", "learning_rate"):
         np.testing.assert_allclose(found[name], [row[name] for row in rows], rtol=1e-6)
+    finals = {f"final/{n}": x for n, x in result.summary["sauna/0"].items() if isinstance(x, float)}
+    assert finals and all(found[name] == [np.float32(x)] for name, x in finals.items())
+    (text,) = others["settings/text_summary"].tensor.string_val
+    assert b"| seed | `0` |" in text and str(result.path).encode() in text
+    started = HParamsPluginData.FromString(
+        others["_hparams_/session_start_info"].metadata.plugin_data.content
+    ).session_start_info.hparams
+    assert started["arm"].string_value == "sauna" and started["gamma"].number_value == 0.99
+    assert started["run_directory"].string_value == str(result.path)
 
 
 def test_a_tracker_of_one_s_own_gets_all_and_the_summary_says_where(result) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from helpers import SMALL, environment, equal, make_job, own, train_here
 from sauna.config.presets import resolve, resolve_run
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
+from threads import trained_here
 
 ENV = "small_envs:Scripted"
 ARMS = [
@@ -72,6 +75,38 @@ def test_off_means_off(target: str, trunk: str) -> None:
     assert equal(own(ppo.final, "ppo/0"), own(off.final, "sauna/0"))
     on = train_here(make_job(ENV, arm="sauna", threshold=0.9, vex_target=target, **common))
     assert not equal(own(ppo.final, "ppo/0"), own(on.final, "sauna/0"))
+
+
+MOVED = {
+    "eval_every": 64,
+    "eval_episodes": 2,
+    "clip_range_schedule": "cosine",
+    "entropy_coef": 0.01,
+    "entropy_coef_schedule": "linear",
+    "warmup": 0.25,
+}
+
+
+def test_off_means_off_with_evaluations_schedules_and_a_callback(tmp_path: Path) -> None:
+    """Also where the callback stops a member, of the run as a user starts it."""
+
+    def callback(row: dict[str, Any]) -> bool:
+        return row["seed"] == 1 and row["env_steps"] >= 128
+
+    settings = {**SMALL, **MOVED, "envs": 2, "steps": 256, "seeds": 2, "processes": 1}
+    found = {}
+    with trained_here():
+        for arm, off in (("ppo", {}), ("sauna", {"threshold": 0.0, "vex_coef": 0.0})):
+            out = tmp_path / arm
+            how = {"arm": arm, "out": out, "quiet": True, "callback": callback}
+            result = sauna.train(ENV, **how, **settings, **off)
+            stops = [member.get("stopped_early") for member in result.summary.values()]
+            assert stops == [None, "callback"]
+            found[arm] = checkpoint.load_newest(out / "checkpoints", print).arrays
+    for seed in (0, 1):
+        ppo = own(found["ppo"], f"ppo/{seed}")
+        assert equal(ppo, own(found["sauna"], f"sauna/{seed}"))
+        assert ppo["/evaluation/best_env_steps"] > 0 and any(n.startswith("/best/") for n in ppo)
 
 
 def test_off_is_off_for_the_reference_options_too() -> None:

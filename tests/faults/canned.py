@@ -25,6 +25,7 @@ from sauna.training.worker import PipeReporter
 ENV = "small_envs:Scripted"
 BACKENDS = {"host": ENV, "device": "jax_envs:walk"}
 SETTINGS = {**SMALL, "arm": "ppo", "steps": 192, "processes": 1}
+SETTINGS |= {"eval_every": 64, "eval_episodes": 1}
 SAVED = {"checkpoint_every": 2, "keep_checkpoints": 2}
 ITERATIONS = 6
 

@@ -25,6 +25,9 @@ SETTINGS = {
     "processes": 1,
     "eval-every": 640,
     "eval-episodes": 2,
+    "clip-range-schedule": "cosine",
+    "entropy-coef": 0.01,
+    "entropy-coef-schedule": "linear",
 }
 # Where a run's environments are stepped: the environment, and what else differs.
 BACKENDS: dict[str, tuple[str, dict[str, object]]] = {

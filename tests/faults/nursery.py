@@ -4,7 +4,8 @@ Importing JAX takes seconds, and hundreds of trials need a fresh process each. A
 runs the command line's own `main`, and its training workers are forked from it instead of being
 started as `python -m sauna.training.worker`; they are real processes with real pipes, which any
 signal can hit. XLA is started in each of them after the fork, never before. Every row also starts
-some of its trials as a user does, with `python -m sauna`.
+some of its trials as a user does, with an interpreter of their own. Runs on the host have a
+callback.
 
     python -m faults.nursery        answers one JSON line per line of standard input
 """
@@ -58,13 +59,13 @@ class Process:
 
 
 class Started(Process):
-    """As a user starts it: `python -m sauna ...`."""
+    """As a user starts it, in an interpreter of its own."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
         super().__init__(log)
         with log.open("w") as out:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "sauna", *arguments],
+                [sys.executable, "-m", "faults.called_back", *arguments],
                 stdout=out,
                 stderr=out,
                 env=environment(),
@@ -236,10 +237,12 @@ def _run(arguments: list[str], log: str, at: float, silence: float) -> None:
         os.dup2(source, target)
     _close_all_but()
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    from faults.called_back import call_back
     from sauna import cli
     from sauna.system import watchdog
     from sauna.training import coordinator
 
+    call_back()
     coordinator.start_worker, watchdog.MAX_SILENCE = _fork_worker, silence
     time.sleep(max(0.0, at - time.monotonic()))
     code = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import random
 import time
 from functools import partial
@@ -39,6 +40,10 @@ from sauna.training.loop.device_program import (
     make_iteration,
     several,
 )
+from sauna.training.loop.evaluation import Evaluator
+from sauna.training.loop.member_state import Counters
+from sauna.training.loop.players import Frozen, HostPlayer, WorkerPlayer
+from small_envs import Poisoned
 from threads import trained_here
 
 SEEDS = [(3, 0), (3, 1), (5, 0)]
@@ -68,7 +73,8 @@ def cases() -> list[dict[str, Any]]:
 
 
 def experiment(least: int, seed: int, place: Path) -> Result:
-    """The matrix in one process, and a part of it in workers; inside of a rollout; on the device.
+    """The matrix in one process, and a part of it in workers; inside of a rollout; on the device;
+    inside of an evaluation.
 
     `worst`: seconds from the step that gave the number to the error.
     """
@@ -88,6 +94,7 @@ def _on_the_host(chosen: list[dict[str, Any]], rng: random.Random, tally: Tally)
         _play("workers", kwargs, tally)
     for kwargs in rng.sample(cases(), 4 if len(chosen) >= 50 else 1):
         _collect(kwargs, tally)
+    _in_evaluations(chosen, rng.sample(chosen, max(1, len(chosen) // 20)), tally)
 
 
 def _play(backend: str, kwargs: dict[str, Any], tally: Tally) -> None:
@@ -154,6 +161,42 @@ def _collect(kwargs: dict[str, Any], tally: Tally) -> None:
     parts = [moments.mean, moments.variance, collector._observed, *collector.reward_moments]
     if not all(np.isfinite(part).all() for part in parts):
         tally.miss(f"{kwargs}: it reached the moments or the buffer")
+
+
+def _in_evaluations(here: list[dict[str, Any]], there: list[dict[str, Any]], tally: Tally) -> None:
+    """In this process, and in a worker. Nothing of the evaluation may be kept.
+
+    In this process nobody reads the observation after an episode's last step, a number or not.
+    """
+    good = json.dumps({"field": "reward", "value": "nan", "episode": 10**9})
+    settings = {"arm": "ppo", "eval_every": 32, "eval_episodes": 4}
+    job = make_job("small_envs:Poisoned", env_kwargs=good, **settings)
+    policy = make_program(job.config, job.spaces).policy
+    frozen = Frozen(np.asarray(policy.init(member_keys(0).init)), None)
+    here = [one for one in here if one["field"] != "final" and one["step"] == 1]
+    player = HostPlayer(job)
+    player(frozen, job.members[0], [0])  # makes its policy, which is compiled once
+    for kwargs in here:
+        player._env = Poisoned(**kwargs)
+        _evaluate(Evaluator(job, policy, player), frozen, kwargs, tally)
+    for kwargs in there:
+        worker = WorkerPlayer(job._replace(env_kwargs=kwargs))
+        _evaluate(Evaluator(job, policy, worker), frozen, kwargs, tally)
+        worker.close()
+
+
+def _evaluate(evaluator: Evaluator, frozen: Frozen, kwargs: dict[str, Any], tally: Tally) -> None:
+    tally.tried += 1
+    tally.count("inside of an evaluation")
+    try:
+        evaluator.after(0, Counters(env_steps=32), 0, lambda: frozen)
+        tally.miss(f"evaluation: {kwargs}: it got through")
+    except EnvironmentFailure as error:
+        wanted = ["evaluation of ppo/0: ", f" is {kwargs['value']}"]
+        if not all(part in str(error) for part in wanted):
+            tally.lose(f"evaluation: {kwargs}: says {str(error)!r}, without {wanted}")
+    if evaluator.to_arrays():
+        tally.miss(f"evaluation: {kwargs}: it was kept as the best")
 
 
 ENVS = 3  # on the device

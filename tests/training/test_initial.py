@@ -79,6 +79,41 @@ def test_the_best_of_a_named_member_can_be_taken(trained) -> None:
         assert equal(under(f"{name}/params/", arrays), best)
 
 
+NEVER = {"field": "reward", "value": "nan", "episode": 10**9}
+ELSEWHERE: dict[str, dict[str, tuple[str, dict[str, Any]]]] = {
+    "small_envs:Scripted": {
+        "another id": ("small_envs:Informative", {}),
+        "other arguments": ("small_envs:Poisoned", NEVER),
+        "the other place": ("jax_envs:wide", {}),
+    },
+    "jax_envs:walk": {
+        "another id": ("jax_envs:informative", {}),
+        "other arguments": ("jax_envs:make_walk", {"limit": 1.0}),
+        "the other place": ("small_envs:Pushed", {}),
+    },
+}
+
+
+@pytest.mark.parametrize("where", ELSEWHERE["jax_envs:walk"])
+def test_it_goes_on_in_another_environment_of_the_same_spaces(trained, where: str) -> None:
+    """On the host and on the device, and from the one to the other: the learning rate is so small
+    that the weights stay to the bit, and the normaliser goes on from where it was."""
+    env, run = trained
+    other, kwargs = ELSEWHERE[env][where]
+    source = under("ppo/1/", final(run))
+    more = {"env_kwargs": kwargs, "learning_rate": 1e-30}
+    arrays = initial(other, run, **more)
+    assert equal(under("ppo/1/params/", arrays), under("params/", source))
+    job = make_job(other, **SETTINGS, **more)
+    assert (job.config.backend == "device") == other.startswith("jax_envs")
+    trained_on = train_here(job._replace(initial=arrays))
+    found = under("ppo/1/", trained_on.final)
+    assert equal(under("params/", found), under("params/", source))
+    counts = [arrays["observation_moments/count"].item() for arrays in (source, found)]
+    assert counts[1] - counts[0] >= SMALL["steps"] - 1
+    assert [row["env_steps"] for row in trained_on.rows if row["seed"] == 1] == [32, 64, 96, 128]
+
+
 def test_it_is_copied_so_that_a_resume_needs_no_other_run(trained, tmp_path: Path) -> None:
     env, source = trained
     run = tmp_path / "run"

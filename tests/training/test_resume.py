@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import sauna
+from faults.canned import Ended
 from helpers import SMALL, equal, make_job, resumed, train_here
 from sauna.config import presets
 from sauna.experiments.measure.streams import load_snapshot
@@ -73,6 +74,39 @@ def test_what_moves_during_training_resumes_exactly(env: dict[str, Any]) -> None
     left = 1 - np.arange(8) / 8
     np.testing.assert_allclose(clips, 0.1 * (1 + np.cos(np.pi * (1 - left))), rtol=1e-5)
     np.testing.assert_allclose([row["entropy_coef"] for row in whole.rows], 0.01 * left, rtol=1e-5)
+
+
+def test_evaluations_schedules_and_a_callback_together_resume_exactly(tmp_path: Path) -> None:
+    """Of two members, the callback stops one; the run is interrupted before that, and after it."""
+    settings = {**SMALL, **MOVED, "envs": 2, "steps": 512, "seeds": 2, "processes": 1}
+    settings |= {"eval_every": 64, "eval_episodes": 2, "checkpoint_every": 2, "quiet": True}
+    whole, run = tmp_path / "whole", tmp_path / "run"
+
+    class Enough(Exception):
+        pass
+
+    def stopping(row: dict[str, Any]) -> bool:
+        return row["seed"] == 1 and row["env_steps"] >= 256
+
+    def interrupting(iteration: int) -> Any:
+        def callback(row: dict[str, Any]) -> bool:
+            if row["iteration"] == iteration:
+                raise Enough
+            return stopping(row)
+
+        return callback
+
+    with trained_here():
+        expected = sauna.train(ENV, out=whole, callback=stopping, **settings)
+        with pytest.raises(Enough):
+            sauna.train(ENV, out=run, callback=interrupting(2), **settings)
+        with pytest.raises(Enough):
+            sauna.resume(run, quiet=True, callback=interrupting(6))
+        result = sauna.resume(run, quiet=True, callback=stopping)
+    assert Ended(whole).differs(run) is None
+    stops = [member.get("stopped_early") for member in result.summary.values()]
+    assert stops == [None, "callback"] and result.summary == expected.summary
+    assert sum("eval_returns" in row for row in result.metrics) == 8 + 4
 
 
 def test_resuming_a_complete_run_does_nothing(run: Path, capsys) -> None:

@@ -5,6 +5,8 @@ Of a `Config`, or of an environment's `Spaces` for `needs_spaces`; see `fields.o
 
 from __future__ import annotations
 
+from typing import Any
+
 from sauna.config.choices import BOUNDED
 
 ON_HOST = ("environments on the host", lambda c: c.backend != "device")
@@ -77,12 +79,16 @@ SQUARED = (
 WEIGHTED = ("a loss_weight", lambda c: c.loss_weight != "none")
 STOPPED = ("a stop rule", lambda c: c.stop != "none")
 UNSCHEDULED = ("constant", "kl")  # schedules that do not follow the budget
-SCHEDULED = (
-    "a schedule of the budget",
-    lambda c: any(
-        getattr(c, name) not in UNSCHEDULED for name in vars(c) if name.endswith("_schedule")
-    ),
-)
+
+
+def moved_by(config: Any) -> list[str]:
+    """Names the fields that move a rate over the budget: schedules, and the warm-up."""
+    schedules = [name for name in vars(config) if name.endswith("_schedule")]
+    moving = [name for name in schedules if getattr(config, name) not in UNSCHEDULED]
+    return [*moving, "warmup"] if config.warmup else moving
+
+
+SCHEDULED = ("a schedule of the budget, or a warm-up", lambda c: bool(moved_by(c)))
 EVALUATED = ("eval_every above 0", lambda c: c.eval_every > 0)
 FINE_TUNED = ("init_from", lambda c: bool(c.init_from))
 DATA = "data:"  # before recorded episodes that init_from names

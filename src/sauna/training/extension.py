@@ -1,8 +1,8 @@
 """Training a run further than it was to go: what `resume` may change of its end, and what follows.
 
-Each schedule reads the share of the budget that is left. With more steps that share is larger: from
-there on the run has the values of a run that was given so many steps at once. Restarted schedules
-begin anew at the end of the steps before.
+Each schedule reads the share of the budget that is left, and a warm-up lasts a share of it. With
+more steps both are longer: from there on the run has the values of a run that was given so many
+steps at once. Restarted ones begin anew at the end of the steps before.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import RunConfig
-from sauna.config.readers import UNSCHEDULED
+from sauna.config.readers import moved_by
 from sauna.config.settings import Config, fields_with, to_json
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
@@ -41,8 +41,8 @@ def check_restart(path: Path, before: Config, parsed: Mapping[str, Any]) -> int:
         raise BadInput(f"restart_schedule: needs steps above {before.steps}")
     if not run_directory.is_complete(path):
         raise BadInput(f"restart_schedule: {path} is not complete; resume it first")
-    if not schedules(before):
-        raise BadInput("restart_schedule: the run has no schedule; all of its rates are constant")
+    if not moved_by(before):
+        raise BadInput("restart_schedule: the run has no schedule or warm-up of its budget")
     return before.steps
 
 
@@ -62,18 +62,12 @@ def goes_further(before: Config, after: Config) -> bool:
     return any(getattr(before, name) != getattr(after, name) for name in GOES_FURTHER)
 
 
-def schedules(config: Config) -> list[str]:
-    """Names the fields that schedule a rate over the budget."""
-    names = [name for name in to_json(config) if name.endswith("_schedule")]
-    return [name for name in names if getattr(config, name) not in UNSCHEDULED]
-
-
 def describe_extension(before: Config, after: Config) -> str:
     """Says in a line how far a run goes now, and what its schedules do; empty if not further."""
     if after.steps == before.steps:
         return ""
     text = f"steps: {before.steps:,} -> {after.steps:,}"
-    if not (names := schedules(after)):
+    if not (names := moved_by(after)):
         return text
     named = ", ".join(names)
     if after.schedule_start != before.schedule_start:

@@ -153,6 +153,18 @@ def test_what_a_sampler_leaves_out_is_shown() -> None:
     assert drawn["samples_used"] == ["top-advantage"]
 
 
+def test_seeds_that_were_stopped_early_are_counted() -> None:
+    stopped = cell("sauna", HIGH)
+    for of_seed in stopped["members"][:2]:
+        of_seed["stopped_early"] = "stop_at"
+    found = results(cell("ppo", LOW), stopped)
+    summary = summarize(found)
+    _, ppo, sauna = lines(summary)[:3]
+    assert "6 (2 stopped early)" in sauna and "stopped early" not in ppo
+    page = make_page(found, summary)
+    assert page.count("2 stopped early") == page.count("stopped early") == 1
+
+
 def _drawn(found: dict[str, Any]) -> dict[str, list[str]]:
     """The labels in the first panel of each figure."""
     plots = plots_of(found, summarize(found))

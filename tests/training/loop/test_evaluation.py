@@ -16,11 +16,14 @@ from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.rollout.play import Episode, play, play_on_device
 from sauna.config.presets import resolve
 from sauna.envs.device.contract import flat
-from sauna.system.errors import BadInput
+from sauna.envs.host.contract import EVALUATION, episode_seed
+from sauna.system import checkpoint, run_directory
+from sauna.system.errors import BadInput, SaunaError
 from sauna.training.loop.evaluation import Evaluated
 from sauna.training.summary import STOPS, summarize
 from sauna.training.worker import train_members
 from small_envs import Informative, Scripted
+from threads import trained_here
 
 BACKENDS = {"host": "small_envs:Scripted", "device": "jax_envs:walk"}
 WATCHED = {"eval_every": 64, "eval_episodes": 3, "checkpoint_every": 1}
@@ -65,6 +68,39 @@ def test_every_multiple_is_evaluated_once_by_seeds_of_its_own(both) -> None:
         bests = np.maximum.accumulate([row["eval_return_mean"] for row in mine])
         assert [row["eval_return_best"] for row in mine] == bests.tolist()
         np.testing.assert_allclose(mine[0]["eval_return_std"], np.std(mine[0]["eval_returns"]))
+
+
+def test_in_a_worker_the_evaluations_are_the_same(both) -> None:
+    backend, _, watched = both
+    if backend == "host":
+        found = train_here(of(backend, **WATCHED, env_processes=2))
+        assert found.rows == watched.rows and equal(found.final, watched.final)
+
+
+@pytest.mark.parametrize(
+    "env, more",
+    [
+        ("CartPole-v1", {"eval_deterministic": False}),
+        pytest.param("small_envs:Camera", {}, marks=pytest.mark.slow),
+        ("small_envs:Choosy", {"action_mask": True, "stack": 2, "eval_deterministic": False}),
+        (
+            "small_envs:Informative",
+            {"recurrent": "gru", "recurrent_width": 4, "sequence_length": 8},
+        ),
+        pytest.param(
+            "small_envs:Wide",
+            {"rescale_actions": True, "normalize_observations": False},
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_every_kind_of_environment_is_played_in_a_worker_as_here(env: str, more) -> None:
+    """Pictures, masks and infos go through the pipe; so do actions of each kind."""
+    settings = {"arm": "ppo", "steps": 96, "eval_every": 32, "eval_episodes": 2, **more}
+    here, there = (
+        train_here(make_job(env, env_processes=number, **settings)).rows for number in (0, 1)
+    )
+    assert here == there and all("eval_returns" in row for row in here)
 
 
 @pytest.mark.parametrize("stop", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))])
@@ -161,6 +197,35 @@ def test_stops_and_the_last_evaluation_stand_in_the_summary() -> None:
         },
         "ppo/1": {"env_steps": 30},
     }
+
+
+HERE, THERE = {}, {"env_processes": 1, "env_timeout": 3}  # where the environments are stepped
+
+
+@pytest.mark.parametrize(
+    "what, where, says",
+    [
+        ("raise", HERE, "the environment raised ValueError: the motor is on fire"),
+        ("raise", THERE, r"environment worker 0 .*: environment of seed 0: step raised ValueError"),
+        ("exit", THERE, r"environment worker 0 \(process \d+\) ended with exit code 7"),
+        ("hang", THERE, r"environment worker 0 \(process \d+\) did not answer within 3 s"),
+    ],
+)
+def test_an_environment_that_fails_in_an_evaluation_is_named_and_nothing_is_lost(
+    what: str, where: dict[str, Any], says: str, tmp_path: Path
+) -> None:
+    """The second evaluation fails, in its second episode; the first is in the checkpoint."""
+    run = tmp_path / "run"
+    seed = episode_seed(0, EVALUATION, 5)
+    kwargs = {"what": what, "where": "step", "episode": 4, "seed": seed}
+    settings = {**SMALL, "arm": "ppo", "processes": 1, "checkpoint_every": 1, **where}
+    settings |= {"eval_every": 64, "eval_episodes": 2, "quiet": True, "env_kwargs": kwargs}
+    with trained_here(), pytest.raises(SaunaError, match=f"evaluation of ppo/0: {says}"):
+        sauna.train("small_envs:Failing", out=run, **settings)
+    found = checkpoint.load_newest(run / "checkpoints", print)
+    assert found is not None and found.manifest["iteration"] == len(run_directory.rows(run)) == 3
+    assert found.arrays["ppo/0/evaluation/best_env_steps"] == 64
+    assert not run_directory.is_complete(run)
 
 
 @pytest.mark.parametrize("name", ["eval_episodes", "stop_at", "stop_when_flat"])

@@ -1,4 +1,4 @@
-"""A policy whose parameters and normaliser stay as they are, at raw observations."""
+"""A policy whose parameters and normaliser stay as they are, at rows and at raw observations."""
 
 from __future__ import annotations
 
@@ -19,34 +19,25 @@ from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system.errors import BadInput
 
 
-class FrozenPolicy:
-    """`policy(observation) -> action` for a raw observation of the environment, or a batch.
+class FrozenNetwork:
+    """`network(row) -> action`: of observations and actions as `HostEnvs` has them.
 
-    The action is the distribution's mode unless `deterministic=False` and a key are given.
-
-    A recurrent policy remembers the observations that it is called with: call `reset` at the start
+    A recurrent network remembers the observations that it is called with: call `reset` at the start
     of an episode.
 
     Args:
       config: whose network and normalisation it has.
-      spaces: of `env`.
-      env: a Gymnasium environment, whose spaces are read.
+      spaces: of the environment.
     """
 
-    def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
+    def __init__(self, config: Config, spaces: Spaces) -> None:
         self.config = config
-        self._space = wrapped_space(env, wrapping_of(config))
-        self._sizes = spaces.action_sizes if spaces.mask else ()  # of the masks
-        self._read = observation_reader(self._space)
-        self._write = action_writer(env.action_space, config.rescale_actions)
         self._dtype = spaces.observation_dtype
         self.policy: Policy = make_policy(config, spaces)
         self.params: Any = None
         self.state: Any = ()  # [n, H] of a recurrent policy; () before an episode's first step
         self._moments: Moments | None = None
         self._act = jax.jit(self._choose, static_argnames="deterministic")
-        self._predict = jax.jit(self._heads)
-        self._log_prob = jax.jit(self._likelihood)
 
     def load(self, params: Array, moments: Moments | None) -> None:
         """Takes over parameters `[D]` and moments of `[obs]`; None: nothing is normalised."""
@@ -74,6 +65,67 @@ class FrozenPolicy:
             return distribution.mode(output.policy), state
         noise = distribution.draw(key, output.policy.shape[:-1])
         return self.policy.sample(params, output, noise), state
+
+    def __call__(self, observation: Any, *, deterministic: bool = True, key: Any = None) -> Any:
+        """The action `[A]` for an observation `[*obs]`; see `HostEnvs.step`."""
+        action = self._choices(observation[None], deterministic, key)[0]
+        return to_env(self.policy.distribution, action)
+
+    def _choices(self, rows: np.ndarray, deterministic: bool, key: Any) -> np.ndarray:
+        """What the network chooses for raw observations `[n, *obs]`: `[n, A]`."""
+        if not deterministic and key is None:
+            raise ValueError("a sampled action needs key=jax.random.key(...)")
+        key = jax.random.key(0) if key is None else key
+        state = self.state_for(len(rows))
+        actions, self.state = self._act(
+            self.params, self._seen(rows), state, key, deterministic=deterministic
+        )
+        return np.asarray(actions)
+
+    def state_for(self, number: int) -> Any:
+        """The states `[number, H]` with which as many episodes go on, or begin.
+
+        Raises:
+          BadInput: another number of episodes goes on.
+        """
+        if isinstance(self.state, tuple):
+            return self.policy.initial_state(number)
+        if len(self.state) != number:
+            raise BadInput(
+                f"a recurrent policy remembers {len(self.state)} episodes, and got observations of "
+                f"{number}; call reset() first"
+            )
+        return self.state
+
+    def _seen(self, rows: np.ndarray) -> np.ndarray:
+        """What the network gets of raw observations `[n, *obs]`."""
+        if self._moments is not None:
+            rows = normalize(self._moments, rows, self.config.clip_observations)
+        return rows.astype(self._dtype)
+
+
+class FrozenPolicy(FrozenNetwork):
+    """`policy(observation) -> action` for a raw observation of the environment, or a batch.
+
+    The action is the distribution's mode unless `deterministic=False` and a key are given.
+
+    A recurrent policy remembers the observations that it is called with: call `reset` at the start
+    of an episode.
+
+    Args:
+      config: whose network and normalisation it has.
+      spaces: of `env`.
+      env: a Gymnasium environment, whose spaces are read.
+    """
+
+    def __init__(self, config: Config, spaces: Spaces, env: Any) -> None:
+        super().__init__(config, spaces)
+        self._space = wrapped_space(env, wrapping_of(config))
+        self._sizes = spaces.action_sizes if spaces.mask else ()  # of the masks
+        self._read = observation_reader(self._space)
+        self._write = action_writer(env.action_space, config.rescale_actions)
+        self._predict = jax.jit(self._heads)
+        self._log_prob = jax.jit(self._likelihood)
 
     def __call__(
         self,
@@ -128,32 +180,6 @@ class FrozenPolicy:
         """What the network chooses for one raw observation `[A]`, as a rollout holds it."""
         return self._choices(self._read(observation)[None], deterministic, key)[0]
 
-    def _choices(self, rows: np.ndarray, deterministic: bool, key: Any) -> np.ndarray:
-        """What the network chooses for raw observations `[n, *obs]`: `[n, A]`."""
-        if not deterministic and key is None:
-            raise ValueError("a sampled action needs key=jax.random.key(...)")
-        key = jax.random.key(0) if key is None else key
-        state = self.state_for(len(rows))
-        actions, self.state = self._act(
-            self.params, self._seen(rows), state, key, deterministic=deterministic
-        )
-        return np.asarray(actions)
-
-    def state_for(self, number: int) -> Any:
-        """The states `[number, H]` with which as many episodes go on, or begin.
-
-        Raises:
-          BadInput: another number of episodes goes on.
-        """
-        if isinstance(self.state, tuple):
-            return self.policy.initial_state(number)
-        if len(self.state) != number:
-            raise BadInput(
-                f"a recurrent policy remembers {len(self.state)} episodes, and got observations of "
-                f"{number}; call reset() first"
-            )
-        return self.state
-
     def _rows(self, observation: Any) -> tuple[np.ndarray, bool]:
         """Raw observations as arrays `[n, *obs]`, and whether they came as a batch."""
         try:
@@ -170,12 +196,6 @@ class FrozenPolicy:
     def see(self, observation: Any) -> np.ndarray:
         """What the network gets of one raw observation `[*obs]`: float32, normalised; or uint8."""
         return self._seen(self._read(observation)[None])[0]
-
-    def _seen(self, rows: np.ndarray) -> np.ndarray:
-        """What the network gets of raw observations `[n, *obs]`."""
-        if self._moments is not None:
-            rows = normalize(self._moments, rows, self.config.clip_observations)
-        return rows.astype(self._dtype)
 
     def _heads(self, params: Array, observation: Any) -> Any:
         output = self.policy.apply(params, observation)

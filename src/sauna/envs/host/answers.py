@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sauna.system.errors import one_line
+from sauna.system.errors import SaunaError, one_line
 
 MAX_SIGNED = 2**31 - 1  # the largest seed of a simulator that keeps it in a signed int
 _SAID: set[str] = set()  # warnings of this process
@@ -88,8 +88,8 @@ def reset_with(env: Any, seed: int) -> Any:
     try:
         answer = env.reset(seed=seed)
     except Exception as error:
-        if seed <= MAX_SIGNED or not _is_of_seed(error, seed):
-            raise
+        if seed <= MAX_SIGNED or isinstance(error, SaunaError) or not _is_of_seed(error, seed):
+            raise  # one of ours comes from a worker, which has tried the lower bits already
         answer = env.reset(seed=seed & MAX_SIGNED)
     return first_of(answer)
 

@@ -15,6 +15,7 @@ import numpy as np
 from sauna.envs.spaces import Spaces
 
 Snapshot = dict[str, np.ndarray]
+EVALUATION = 2**31  # the env index of evaluations' episodes: no environment of training has it
 NO_INFO: Mapping[int, Mapping[str, float]] = MappingProxyType({})
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sauna.envs.host.answers import close, five_of, life_lost, one_number, reset_with
-from sauna.envs.host.contract import HostEnvs, Snapshot, Step, episode_seed
+from sauna.envs.host.contract import EVALUATION, HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.info import numbers_of
 from sauna.envs.spaces import action_writer, describe, observation_reader
 from sauna.system.errors import SaunaError, one_line
@@ -38,7 +38,8 @@ class Slot:
     def __init__(self, env: Any, seeds: tuple[int, int]) -> None:
         self.env, self.seeds, self.episode = env, seeds, -1
         self.actions: list[np.ndarray] = []
-        self.name = f"environment {seeds[1]} of seed {seeds[0]}"
+        number = "" if seeds[1] == EVALUATION else f" {seeds[1]}"
+        self.name = f"environment{number} of seed {seeds[0]}"
 
 
 class GymnasiumEnvs(HostEnvs):

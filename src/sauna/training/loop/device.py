@@ -40,7 +40,7 @@ from sauna.training.loop.device_program import (
     is_finite,
     make_mesh,
 )
-from sauna.training.loop.evaluation import DevicePlayer, Evaluator, Frozen, stop_named
+from sauna.training.loop.evaluation import Evaluator, stop_named
 from sauna.training.loop.fine_tuning import (
     as_long_moments,
     initial_moments,
@@ -63,6 +63,7 @@ from sauna.training.loop.multihost import (
     leave,
     read_host_rank,
 )
+from sauna.training.loop.players import DevicePlayer, Frozen
 
 Arrays = dict[str, np.ndarray]
 

@@ -12,41 +12,22 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 
-from sauna.algorithm.policy.frozen import FrozenPolicy
-from sauna.algorithm.policy.normalize import Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import capacity
-from sauna.algorithm.rollout.play import Episode, play, play_on_device, success_rate
+from sauna.algorithm.rollout.play import Episode, success_rate
 from sauna.config.presets import Member
 from sauna.config.settings import Config
-from sauna.envs.device.contract import JaxEnv
-from sauna.envs.host.answers import close
-from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
-from sauna.envs.make import make_env
-from sauna.envs.wrapping import wrapping_of
 from sauna.system.checkpoint import under
 from sauna.system.errors import one_line
 from sauna.training.loop.job import Arrays, Job
 from sauna.training.loop.member_state import Counters, fitting, named_params
+from sauna.training.loop.players import Frozen, Play
 from sauna.training.summary import STOPS
-
-ENV_INDEX = 2**31  # of an evaluation's episodes: no environment of training has it
-
-
-class Frozen(NamedTuple):
-    """What a member acts with at the end of an iteration."""
-
-    params: Any  # [D]
-    moments: Moments | None  # of [obs], float64; None: nothing is normalised
-
-
-Play = Callable[[Frozen, Sequence[int]], list[Episode]]
 
 
 @dataclass
@@ -128,7 +109,7 @@ class Evaluator:
 
     Args:
       policy: of the members, to name the parameters of the best.
-      play: plays an episode for each of several seeds.
+      play: plays episodes of a member, by their numbers.
     """
 
     def __init__(self, job: Job, policy: Policy, play: Play) -> None:
@@ -163,26 +144,27 @@ class Evaluator:
         clock, member, now = time.perf_counter(), self._members[p], frozen()
         first = counters.env_steps // every * self._config.eval_episodes
         numbers = range(first, first + self._config.eval_episodes)
-        seeds = [episode_seed(member.seed, ENV_INDEX, number) for number in numbers]
-        episodes = self._episodes(member, now, seeds)
+        episodes = self._episodes(member, now, numbers)
         found = self._found[p]
         row = found.see(episodes, counters.env_steps, partial(named_frozen, self._policy, now))
         counters.stopped = found.stop(self._config, row["eval_return_mean"])
         self.seconds += time.perf_counter() - clock
         return row
 
-    def _episodes(self, member: Member, frozen: Frozen, seeds: list[int]) -> list[Episode]:
+    def _episodes(self, member: Member, frozen: Frozen, numbers: Sequence[int]) -> list[Episode]:
+        where = f"evaluation of {member.name}"
         try:
-            episodes = self._play(frozen, seeds)
+            episodes = self._play(frozen, member, numbers)
+        except EnvironmentFailure as error:
+            raise EnvironmentFailure(f"{where}: {error}") from error.__cause__
         except Exception as error:
             raise EnvironmentFailure(
-                f"evaluation of {member.name}: the environment raised {one_line(error)}"
+                f"{where}: the environment raised {one_line(error)}"
             ) from error
         for number, episode in enumerate(episodes):
             if not math.isfinite(episode.return_):
                 raise EnvironmentFailure(
-                    f"evaluation of {member.name}: the return of episode {number} is "
-                    f"{episode.return_}"
+                    f"{where}: the return of episode {number} is {episode.return_}"
                 )
         return episodes
 
@@ -210,56 +192,6 @@ def named_frozen(policy: Policy, frozen: Frozen) -> Arrays:
         },
         **{f"observation_moments/{name}": np.array(a) for name, a in moments.items()},
     }
-
-
-class HostPlayer:
-    """Plays in one environment of its own, which is made at the first evaluation."""
-
-    def __init__(self, job: Job) -> None:
-        self._job = job
-        self._env: Any = None
-        self._policy: FrozenPolicy | None = None
-
-    def __call__(self, frozen: Frozen, seeds: Sequence[int]) -> list[Episode]:
-        config = self._job.config
-        if self._policy is None:
-            kwargs = dict(self._job.env_kwargs)
-            self._env = make_env(config.env, kwargs, wrapping_of(config))
-            self._policy = FrozenPolicy(config, self._job.spaces, self._env)
-        self._policy.load(frozen.params, frozen.moments)
-        how, hold = config.eval_deterministic, self._policy.policy.hold
-        return [play(self._policy, self._env, how, seed, hold=hold) for seed in seeds]
-
-    def close(self) -> None:
-        """Closes the environment, if there is one."""
-        if self._env is not None:
-            close(self._env, "the environment of the evaluations")
-
-
-class DevicePlayer:
-    """Plays all episodes of an evaluation at once, in one compiled program."""
-
-    def __init__(self, job: Job, env: JaxEnv, policy: Policy) -> None:
-        self._episodes = jax.jit(
-            partial(
-                play_on_device,
-                config=job.config,
-                env=env,
-                policy=policy,
-                deterministic=job.config.eval_deterministic,
-            )
-        )
-
-    def __call__(self, frozen: Frozen, seeds: Sequence[int]) -> list[Episode]:
-        keys = jax.vmap(jax.random.key)(np.array(seeds, np.uint32))
-        moments = frozen.moments
-        if moments is not None:
-            moments = Moments(*(np.asarray(part, np.float32) for part in moments))
-        played = jax.device_get(self._episodes(np.asarray(frozen.params), moments, keys))
-        return [
-            Episode(float(return_), int(length), bool(cut), float(s) if np.isfinite(s) else None)
-            for return_, length, cut, s in zip(*played, strict=True)
-        ]
 
 
 def stop_named(members: Sequence[Member], counters: Sequence[Counters], names: set[str]) -> None:

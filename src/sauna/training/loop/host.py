@@ -28,7 +28,7 @@ from sauna.envs.workers import ProcessEnvs
 from sauna.envs.wrapping import wrapping_of
 from sauna.system.checkpoint import under
 from sauna.training.loop.budget import budget_left, hypers_now, step_limit
-from sauna.training.loop.evaluation import Evaluator, Frozen, HostPlayer, stop_named
+from sauna.training.loop.evaluation import Evaluator, stop_named
 from sauna.training.loop.fine_tuning import initial_moments, initial_params
 from sauna.training.loop.job import Arrays, Job, Reporter, check_finite
 from sauna.training.loop.member_state import (
@@ -38,6 +38,7 @@ from sauna.training.loop.member_state import (
     unpack_member,
 )
 from sauna.training.loop.metrics import metrics_row
+from sauna.training.loop.players import Frozen, host_player
 
 
 def train_on_host(job: Job, reporter: Reporter) -> None:
@@ -53,7 +54,7 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
     learner = make_learner(config, program.policy, job.spaces)
     keys = [member_keys(member.seed) for member in members]
     draw_key = jax.jit(selection_key)
-    envs, player = make_envs(job), HostPlayer(job)
+    envs, player = make_envs(job), host_player(job)
     evaluator = Evaluator(job, program.policy, player)
     try:
         collector = HostCollector(program, job.spaces, envs, keys)
