@@ -12,6 +12,7 @@ import pytest
 
 import sauna
 import small_envs
+from command_line import sauna as sauna_process
 from faults.hostile_runs import change_manifest
 from helpers import SMALL
 from sauna import cli
@@ -144,6 +145,21 @@ def test_frames_of_odd_sides_and_without_a_rate_become_a_video(endless: Path) ->
     assert frames.shape == (10, 42, 46, 3) and result["video"].endswith("ppo-0_sampled_3.mp4")
     np.testing.assert_allclose(frames.mean((1, 2, 3)), np.arange(10) * 20, atol=8)
     assert [path.name for path in (endless / "videos").iterdir()] == ["ppo-0_sampled_3.mp4"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Hopper-v5", "CartPole-v1"])
+def test_a_policy_of_the_zoo_plays_at_once_and_is_recorded(name: str, tmp_path: Path) -> None:
+    arguments = ["--video", "--episodes", "2", "--max-steps", "60"]
+    done = sauna_process("eval", f"zoo:{name}", *arguments, cwd=tmp_path)
+    if "cannot be drawn here" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    path = Path(done.stdout.splitlines()[-1].removeprefix("video: "))
+    assert path.parent == tmp_path / "runs" / f"zoo-{name}" / "videos"
+    frames = imageio.imread(path).astype(int)
+    assert len(frames) == 61 and frames[0].std() > 1  # the policy stands for 60 steps
+    assert np.abs(frames[0] - frames[-1]).max() > 50  # and moves
 
 
 def test_frames_go_to_the_encoder_one_by_one(tmp_path: Path, monkeypatch) -> None:
