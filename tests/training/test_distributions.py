@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from helpers import SMALL, configured, equal, make_job, resumed, train_here
+from joined_rules import JOINED, joined
 from sauna.algorithm.policy.bounded import to_env
 from sauna.algorithm.policy.frozen import FrozenPolicy
 from sauna.algorithm.policy.policy import make_policy
 from sauna.algorithm.rollout.actor import make_actor
-from sauna.config.presets import ARMS, resolve
+from sauna.config.presets import resolve
 from sauna.envs.spaces import Spaces, describe
 from sauna.system.errors import BadInput
 from sauna.training.prepare import prepare
@@ -144,31 +145,11 @@ def test_the_default_is_the_gaussian_to_the_bit() -> None:
     assert to_env(make_policy(plain.config, plain.spaces).distribution, action) is action
 
 
-# Every rule once, joined so that few programs have to be compiled.
-JOINED = (
-    "ppo",
-    "sauna+gigaflow+spo",
-    "sauna-paper+top-advantage+avec",
-    "sauna-reference",
-    "random-drop+prioritized+target-kl",
-    "gradient-norm+sample-dropout+espo",
-    "kondo+merl",
-    "pods+recompute",
-    "vex-oracle+delight",
-    "vex-head+positive",
-)
-
-
-def test_the_joined_arms_hold_every_rule() -> None:
-    assert {part for arm in JOINED for part in arm.split("+")} == set(ARMS)
-
-
 @slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("arm", JOINED)
 def test_every_rule_trains_with_every_distribution_or_is_refused(kind: str, arm: str) -> None:
-    settings: dict[str, Any] = {"arm": arm, "distribution": kind, "envs": 2, "steps": 128}
-    settings |= {"drop_rate": 0.3} if "random-drop" in arm else {}
+    settings: dict[str, Any] = {**joined(arm), "distribution": kind, "envs": 2, "steps": 128}
     if kind == "gsde" and "gradient-norm" in arm:
         with pytest.raises(BadInput, match="no formula"):
             make_job(DEVICE, **settings)

@@ -1,4 +1,4 @@
-"""Every rule of selection works with the MLP, and rules of each kind with other networks."""
+"""Every rule works with the MLP, the Nature CNN and bits; rules of each kind with the others."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from helpers import make_job, train_here
+from joined_rules import JOINED, joined
+from sauna.config.presets import ARMS as RULES
 
 NETWORKS = {
     "mlp": {
@@ -18,24 +20,27 @@ NETWORKS = {
     },
     "small-cnn": {"env": "small_envs:Board", "network": "small-cnn"},
     "impala-cnn": {"env": "small_envs:Board", "network": "impala-cnn", "trunk": "shared"},
+    "nature-cnn": {"env": "small_envs:Picture", "network": "nature-cnn"},
+    "bits": {"env": "small_envs:Spaced", "env_kwargs": {"action": "multi_binary"}, "hidden": "6"},
     "rows together": {"env": "vector_envs:same", "hidden": "6", "dropped": "mask"},
 }
+ARMS = [*RULES, "gigaflow+random"]
+FAST = [("sauna", "small-cnn")]
 # Those whose interface to a network differs: a filter, the head's gradient, a head of its own,
 # values anew, a weight of the loss.
 KINDS = ["sauna", "gradient-norm", "merl", "recompute", "delight"]
-ARMS = [
-    *KINDS,
-    *("sauna-paper", "sauna-reference", "vex-head", "random-drop", "gigaflow", "top-advantage"),
-    *("prioritized", "kondo", "pods", "vex-oracle", "positive", "sample-dropout", "espo"),
-    *("target-kl", "spo", "avec", "gigaflow+random"),
-]
 PAIRS = [
     *((arm, "mlp") for arm in ARMS),
+    *((arm, network) for network in ("nature-cnn", "bits") for arm in JOINED),
     *((arm, "rows together") for arm in KINDS),
     *((arm, "small-cnn") for arm in ("sauna", "gradient-norm", "merl")),
     *((arm, "impala-cnn") for arm in ("sauna", "gradient-norm")),
 ]
-FAST = [("sauna", "small-cnn")]
+FILTERS = {"sauna", "sauna-paper", "sauna-reference", "random-drop"}
+
+
+def test_the_joined_arms_hold_every_rule() -> None:
+    assert {part for arm in JOINED for part in arm.split("+")} == set(RULES)
 
 
 @pytest.mark.parametrize(
@@ -43,12 +48,11 @@ FAST = [("sauna", "small-cnn")]
     [pair if pair in FAST else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
 )
 def test_a_rule_learns_with_a_network(arm: str, network: str) -> None:
-    settings = {"arm": arm, "rollout_steps": 16, "envs": 2, "epochs": 1, **NETWORKS[network]}
-    if arm == "recompute":
+    settings = {**joined(arm), "rollout_steps": 16, "envs": 2, "epochs": 1, **NETWORKS[network]}
+    rules = set(arm.split("+"))
+    if "recompute" in rules:
         settings["epochs"] = 2
-    if arm == "random-drop":
-        settings["drop_rate"] = 0.3
-    if "dropped" in settings and arm not in ("sauna", "sauna-paper", "random-drop"):
+    if "dropped" in settings and not rules & FILTERS:
         del settings["dropped"]  # which only a filter reads
     found = train_here(make_job(**settings, steps=128))
     assert {row["arm"] for row in found.rows} == {arm} and len(found.rows) > 1
