@@ -20,8 +20,9 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset's
 SEARCHES = {
-    "Pendulum-v1": f"{START} --envs 4 --steps 1e5",
-    "LunarLander-v3": f"{START} --envs 16 --rollout-steps 256 --steps 3e5",
+    "Pendulum-v1": f"Pendulum-v1 {START} --envs 4 --steps 1e5",
+    "Pendulum-v1, 2 seeds a trial": f"Pendulum-v1 {START} --envs 4 --steps 1e5 --seeds 2",
+    "LunarLander-v3": f"LunarLander-v3 {START} --envs 16 --rollout-steps 256 --steps 1e5",
 }
 TRIALS, MEMBERS = 40, 8
 OF_SEARCH = f"--trials {TRIALS} --lockstep 8"
@@ -49,7 +50,7 @@ KEPT = ("number", "state", "return", "env_steps", "searched", "error")
 
 def commands() -> dict[str, str]:
     """Lists every command, by the name of its results."""
-    found = {env: f"sauna tune {env} {more} {OF_SEARCH}" for env, more in SEARCHES.items()}
+    found = {name: f"sauna tune {own} {OF_SEARCH}" for name, own in SEARCHES.items()}
     for seed in SEEDS:
         for kind, more in KINDS.items():
             found[f"{kind} {seed}"] = f"sauna tune {EQUAL} {more} --seed {seed}"
@@ -70,7 +71,8 @@ def collect(stored: Mapping[str, Any], runs: Path) -> dict[str, Any]:
         found, when = json.loads(path.read_text()), finished(path)
         plan = found["tune"]
         if "rollout_steps" in plan["values"]:
-            name = command = found["env"]
+            seeds = len(plan["seeds"])
+            name = command = found["env"] + (f", {seeds} seeds a trial" if seeds > 1 else "")
             parts, part = searches, search(found, path.parent)
             has_ended = len(part["trials"]) >= TRIALS and part["verdict"]["believed"] is not None
         else:

@@ -14,21 +14,21 @@ COMMAND = "`python results/tune.py` (numbers and the table of all trials: `resul
 def tune_text(found: Mapping[str, Any]) -> str:
     """Searches on fresh seeds, and populations beside random searches."""
     parts = [COMMAND]
-    for env, search in found["searches"].items():
-        parts += [_search(env, search, found["commands"][env]), _fresh(search)]
+    for name, search in found["searches"].items():
+        parts += [_search(name, search, found["commands"][name]), _fresh(search)]
     if any(found["equal_steps"].values()):
         parts += [_equal(found["equal_steps"])]
     return "\n\n".join(parts)
 
 
-def _search(env: str, search: Mapping[str, Any], command: str) -> str:
+def _search(name: str, search: Mapping[str, Any], command: str) -> str:
     states = Counter(trial["state"] for trial in search["trials"])
     ended = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
     best = next(t for t in search["trials"] if t["number"] == search["best"])
     start = search["trials"][0]
     steps = search["env_steps"]
     parts = [
-        f"**{env}**, {search['steps']:,} env steps: `{command}`.",
+        f"**{name}**, {search['steps']:,} env steps: `{command}`.",
         f"Of {len(search['trials'])} trials: {ended};",
         f"{steps['trials']:,} env steps of trials, {steps['fresh']:,} on further seeds.",
         f"The first trial, from the poor start, returned {start['return']:.0f};",

@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Generator
 from contextlib import nullcontext
+from itertools import count
 from unittest.mock import patch
 
 import pytest
@@ -22,6 +23,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 configure_jax()
 
+import jax  # noqa: E402
+
 from shared_programs import forget, share_programs  # noqa: E402
 
 share_programs()  # before a module imports the functions that make them
@@ -30,6 +33,8 @@ from threads import trained_here  # noqa: E402
 
 gc.disable()  # while all modules are imported: nothing of that is garbage
 
+MANY_MAPPINGS = 30_000  # Linux aborts a process that wants more than 65,530, as all slow tests do
+_ended = count(1)  # tests
 ALLOWED = ("one combination is enough",)  # parts of reasons; none is about a tool that is missing
 Report = pytest.TestReport | pytest.CollectReport
 
@@ -65,7 +70,21 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     drawn = own_choice or item.get_closest_marker("draws")
     undrawn = nullcontext() if drawn else patch("sauna.api.draw_curve", lambda run: None)
     with nullcontext() if real else trained_here(), undrawn:
-        return (yield)
+        result = yield
+    if next(_ended) % 50 == 0 and _mapped() > MANY_MAPPINGS:
+        forget()
+        jax.clear_caches()
+        gc.collect()
+    return result
+
+
+def _mapped() -> int:
+    """Pieces of memory that this process has mapped; each compiled program takes some (Linux)."""
+    try:
+        with open("/proc/self/maps", "rb") as maps:
+            return maps.read().count(b"\n")
+    except OSError:
+        return 0
 
 
 @pytest.hookimpl(wrapper=True)
