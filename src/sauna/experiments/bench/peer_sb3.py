@@ -104,7 +104,7 @@ def make_model() -> PPO | A2C:
         ),
         "normalize_advantage": settings["normalize_advantages"],
         "ent_coef": settings["entropy_coef"],
-        "vf_coef": settings["value_coef"],
+        "vf_coef": settings["value_coef"] / 2,  # our value loss has the factor 0.5 inside
         "max_grad_norm": settings["max_grad_norm"],
         "gamma": settings["gamma"],
         "gae_lambda": settings["gae_lambda"],
