@@ -45,7 +45,7 @@ $(VENV)/.ci: $(BIN)/python pyproject.toml constraints.txt
 	@touch $@ $(VENV)/.dev $(VENV)/.run
 
 $(VENV)/.slow: $(BIN)/python pyproject.toml constraints.txt
-	$(INSTALL) '.[dev,docs,cluster,brax,playground,onnx,minari,parquet,hub,pettingzoo]'
+	$(INSTALL) '.[dev,docs,cluster,brax,playground,onnx,minari,parquet,hub,pettingzoo,tune,envpool,wandb,trackio,mlflow]'
 	@$(COMPILE)
 	@touch $@ $(VENV)/.ci $(VENV)/.dev $(VENV)/.docs $(VENV)/.run
 
