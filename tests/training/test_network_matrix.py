@@ -1,4 +1,4 @@
-"""Every rule works with the MLP, the Nature CNN and bits; rules of each kind with the others."""
+"""Every rule of selection works with every network, a memory, bits, and rows together."""
 
 from __future__ import annotations
 
@@ -21,20 +21,22 @@ NETWORKS = {
     "small-cnn": {"env": "small_envs:Board", "network": "small-cnn"},
     "impala-cnn": {"env": "small_envs:Board", "network": "impala-cnn", "trunk": "shared"},
     "nature-cnn": {"env": "small_envs:Picture", "network": "nature-cnn"},
+    "lstm": {
+        "env": "small_envs:Scripted",
+        "hidden": "6",
+        "recurrent": "lstm",
+        "recurrent_width": 4,
+        "sequence_length": 8,
+    },
     "bits": {"env": "small_envs:Spaced", "env_kwargs": {"action": "multi_binary"}, "hidden": "6"},
     "rows together": {"env": "vector_envs:same", "hidden": "6", "dropped": "mask"},
 }
 ARMS = [*RULES, "gigaflow+random"]
 FAST = [("sauna", "small-cnn")]
-# Those whose interface to a network differs: a filter, the head's gradient, a head of its own,
-# values anew, a weight of the loss.
-KINDS = ["sauna", "gradient-norm", "merl", "recompute", "delight"]
 PAIRS = [
+    *FAST,
     *((arm, "mlp") for arm in ARMS),
-    *((arm, network) for network in ("nature-cnn", "bits") for arm in JOINED),
-    *((arm, "rows together") for arm in KINDS),
-    *((arm, "small-cnn") for arm in ("sauna", "gradient-norm", "merl")),
-    *((arm, "impala-cnn") for arm in ("sauna", "gradient-norm")),
+    *((arm, network) for network in NETWORKS if network != "mlp" for arm in JOINED),
 ]
 FILTERS = {"sauna", "sauna-paper", "sauna-reference", "random-drop"}
 
