@@ -22,6 +22,11 @@ START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset
 SEARCHES = {
     "Pendulum-v1": f"Pendulum-v1 {START} --envs 4 --steps 1e5",
     "Pendulum-v1, 2 seeds a trial": f"Pendulum-v1 {START} --envs 4 --steps 1e5 --seeds 2",
+    # The preset's exploration, too; twice as many finalists.
+    "Pendulum-v1, gSDE": (
+        f"Pendulum-v1 {START} --distribution gsde --sde-sample-freq 4 --envs 4 --steps 1e5 "
+        "--finalists 8"
+    ),
     "LunarLander-v3": f"LunarLander-v3 {START} --envs 16 --rollout-steps 256 --steps 1e5",
 }
 TRIALS, MEMBERS = 40, 8
@@ -71,8 +76,7 @@ def collect(stored: Mapping[str, Any], runs: Path) -> dict[str, Any]:
         found, when = json.loads(path.read_text()), finished(path)
         plan = found["tune"]
         if "rollout_steps" in plan["values"]:
-            seeds = len(plan["seeds"])
-            name = command = found["env"] + (f", {seeds} seeds a trial" if seeds > 1 else "")
+            name = command = name_of(found)
             parts, part = searches, search(found, path.parent)
             has_ended = len(part["trials"]) >= TRIALS and part["verdict"]["believed"] is not None
         else:
@@ -84,6 +88,13 @@ def collect(stored: Mapping[str, Any], runs: Path) -> dict[str, Any]:
             parts[name] = {**part, "finished": when}
             typed[command] = found["command"]
     return {"commands": typed, "searches": searches, "equal_steps": equal}
+
+
+def name_of(found: Mapping[str, Any]) -> str:
+    """The name in `SEARCHES` of a tuning: the environment, and what sets it apart."""
+    seeds = len(found["tune"]["seeds"])
+    apart = [f"{seeds} seeds a trial"] * (seeds > 1) + ["gSDE"] * ("gsde" in found["command"])
+    return ", ".join([found["env"], *apart])
 
 
 def of_equal(found: Mapping[str, Any]) -> dict[str, Any]:
