@@ -212,7 +212,7 @@ def fine_tuning_page(found: Mapping[str, Any]) -> str:
     rows = [["Training", "Return of each seed", "Mean", "Length", "Speed of each seed, m/s"]]
     for arm, unit in found["arms"].items():
         shown = ", ".join(f"{value:,.0f}" for value in unit["returns"])
-        speeds = ", ".join(f"{value:.2f}" for value in unit["speeds"])
+        speeds = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in unit["speeds"])
         mean, length = np.mean(unit["returns"]), np.mean(unit["lengths"])
         rows.append([arm, shown, f"{mean:,.0f}", f"{length:,.0f}", speeds])
     return page(
