@@ -58,7 +58,7 @@ HEAD = [
     "Return of each seed",
     "Mean and spread",
     "RL Zoo",
-    "Minutes",
+    "CPU minutes",
 ]
 
 
@@ -72,7 +72,7 @@ def _row(env: str, unit: Mapping[str, Any]) -> list[str]:
         ", ".join(f"{value:,.{digits}f}" for value in returns),
         f"{np.mean(returns):,.{digits}f} ± {np.std(returns, ddof=1):,.{digits}f}",
         _published(env),
-        f"{unit['wall_seconds'] / 60:.1f}",
+        f"{unit['cpu_seconds'] / 60:.1f}",
     ]
 
 

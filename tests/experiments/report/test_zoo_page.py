@@ -19,7 +19,7 @@ def unit(*returns: float) -> dict[str, Any]:
         "preset": "lunar-lander",
         "steps": 1_000_000,
         "returns": dict(zip(names, returns, strict=True)),
-        "wall_seconds": 90.0,
+        "cpu_seconds": 90.0,
         "curves": dict.fromkeys(names, curve),
     }
 
