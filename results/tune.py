@@ -19,18 +19,16 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset's
+GSDE = "--distribution gsde --sde-sample-freq 4 --envs 4 --steps 1e5 --finalists 8"
 SEARCHES = {
     "Pendulum-v1": f"Pendulum-v1 {START} --envs 4 --steps 1e5",
     "Pendulum-v1, 2 seeds a trial": f"Pendulum-v1 {START} --envs 4 --steps 1e5 --seeds 2",
-    # The preset's exploration, too; twice as many finalists.
-    "Pendulum-v1, gSDE": (
-        f"Pendulum-v1 {START} --distribution gsde --sde-sample-freq 4 --envs 4 --steps 1e5 "
-        "--finalists 8"
-    ),
+    # The preset's exploration, too, and twice as many finalists. Then more shapes of the program.
+    "Pendulum-v1, gSDE": f"Pendulum-v1 {START} {GSDE}",
+    "Pendulum-v1, gSDE, lockstep 2": f"Pendulum-v1 {START} {GSDE} --lockstep 2",
     "LunarLander-v3": f"LunarLander-v3 {START} --envs 16 --rollout-steps 256 --steps 1e5",
 }
-TRIALS, MEMBERS = 40, 8
-OF_SEARCH = f"--trials {TRIALS} --lockstep 8"
+TRIALS, MEMBERS, LOCKSTEP = 40, 8, 8
 SPACE = """
 learning_rate = {low = 1e-5, high = 1e-2, log = true}
 clip_range = [0.1, 0.2, 0.3, 0.4]
@@ -55,7 +53,10 @@ KEPT = ("number", "state", "return", "env_steps", "searched", "error")
 
 def commands() -> dict[str, str]:
     """Lists every command, by the name of its results."""
-    found = {name: f"sauna tune {own} {OF_SEARCH}" for name, own in SEARCHES.items()}
+    found = {name: f"sauna tune {own} --trials {TRIALS}" for name, own in SEARCHES.items()}
+    for name, command in found.items():
+        if "--lockstep" not in command:
+            found[name] = f"{command} --lockstep {LOCKSTEP}"
     for seed in SEEDS:
         for kind, more in KINDS.items():
             found[f"{kind} {seed}"] = f"sauna tune {EQUAL} {more} --seed {seed}"
@@ -92,9 +93,14 @@ def collect(stored: Mapping[str, Any], runs: Path) -> dict[str, Any]:
 
 def name_of(found: Mapping[str, Any]) -> str:
     """The name in `SEARCHES` of a tuning: the environment, and what sets it apart."""
-    seeds = len(found["tune"]["seeds"])
-    apart = [f"{seeds} seeds a trial"] * (seeds > 1) + ["gSDE"] * ("gsde" in found["command"])
-    return ", ".join([found["env"], *apart])
+    plan = found["tune"]
+    seeds, lockstep = len(plan["seeds"]), plan["lockstep"]
+    apart = {
+        f"{seeds} seeds a trial": seeds > 1,
+        "gSDE": "gsde" in found["command"],
+        f"lockstep {lockstep}": lockstep != LOCKSTEP,
+    }
+    return ", ".join([found["env"], *(words for words, holds in apart.items() if holds)])
 
 
 def of_equal(found: Mapping[str, Any]) -> dict[str, Any]:
