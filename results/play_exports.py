@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from onnxruntime import InferenceSession
 
 PACKAGES = ("numpy", "safetensors", "onnxruntime")
 OURS = ("sauna", "jax", "jaxlib", "flax", "optax", "gymnasium")
@@ -53,6 +52,8 @@ def _put(place: dict[Any, Any], keys: list[Any], value: Any) -> None:
 
 def onnx_form(folder: Path, case: dict[str, Any]) -> Step:
     """`policy.onnx`, by ONNX Runtime."""
+    from onnxruntime import InferenceSession
+
     session = InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
     name, size = case["state"] or ("", 0)
 
