@@ -118,6 +118,9 @@ def measure(names: Sequence[str]) -> None:
             continue
         command = [sys.executable, "-m", "sauna", "bench", *flags[name]]
         if name.endswith("purejaxrl"):
+            if "PUREJAXRL" not in os.environ:
+                print(f"{name}: left out; PUREJAXRL names no copy of its folder")
+                continue
             command += ["--script", str(Path(os.environ["PUREJAXRL"]) / "ppo.py")]
         file = str(RESULTS / f"{name}.json")
         subprocess.run([*command, "--json", file], check=True, cwd=ROOT / "benchmarks")

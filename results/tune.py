@@ -19,16 +19,21 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset's
+TRIALS, MEMBERS, LOCKSTEP = 40, 8, 8
+TOGETHER = f"--lockstep {LOCKSTEP}"
 GSDE = "--distribution gsde --sde-sample-freq 4 --envs 4 --steps 1e5 --finalists 8"
 SEARCHES = {
-    "Pendulum-v1": f"Pendulum-v1 {START} --envs 4 --steps 1e5",
-    "Pendulum-v1, 2 seeds a trial": f"Pendulum-v1 {START} --envs 4 --steps 1e5 --seeds 2",
+    "Pendulum-v1": f"Pendulum-v1 {START} --envs 4 --steps 1e5 {TOGETHER}",
+    "Pendulum-v1, 2 seeds a trial": (
+        f"Pendulum-v1 {START} --envs 4 --steps 1e5 --seeds 2 {TOGETHER}"
+    ),
     # The preset's exploration, too, and twice as many finalists. Then more shapes of the program.
-    "Pendulum-v1, gSDE": f"Pendulum-v1 {START} {GSDE}",
+    "Pendulum-v1, gSDE": f"Pendulum-v1 {START} {GSDE} {TOGETHER}",
     "Pendulum-v1, gSDE, lockstep 2": f"Pendulum-v1 {START} {GSDE} --lockstep 2",
-    "LunarLander-v3": f"LunarLander-v3 {START} --envs 16 --rollout-steps 256 --steps 1e5",
+    "LunarLander-v3": (
+        f"LunarLander-v3 {START} --envs 16 --rollout-steps 256 --steps 1e5 {TOGETHER}"
+    ),
 }
-TRIALS, MEMBERS, LOCKSTEP = 40, 8, 8
 SPACE = """
 learning_rate = {low = 1e-5, high = 1e-2, log = true}
 clip_range = [0.1, 0.2, 0.3, 0.4]
@@ -54,9 +59,6 @@ KEPT = ("number", "state", "return", "env_steps", "searched", "error")
 def commands() -> dict[str, str]:
     """Lists every command, by the name of its results."""
     found = {name: f"sauna tune {own} --trials {TRIALS}" for name, own in SEARCHES.items()}
-    for name, command in found.items():
-        if "--lockstep" not in command:
-            found[name] = f"{command} --lockstep {LOCKSTEP}"
     for seed in SEEDS:
         for kind, more in KINDS.items():
             found[f"{kind} {seed}"] = f"sauna tune {EQUAL} {more} --seed {seed}"

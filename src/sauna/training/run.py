@@ -129,7 +129,7 @@ def create(
 
     Args:
       prepared: the run; its `out` names the directory.
-      display: what is said goes there.
+      display: shows the messages.
       initial: what it starts from, of `read_initial`.
 
     Raises:

@@ -33,9 +33,8 @@ class Clock:
     """A display that shows nothing and notes when each iteration's rows arrive."""
 
     def __init__(self) -> None:
-        self.seen: dict[
-            str, list[tuple[float, int, int]]
-        ] = {}  # member: time, iteration, env steps
+        # Of each member: time, iteration, env steps.
+        self.seen: dict[str, list[tuple[float, int, int]]] = {}
         self.started = time.perf_counter()
 
     def say(self, text: str) -> None:

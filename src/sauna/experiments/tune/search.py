@@ -208,7 +208,7 @@ class Watch:
     def __call__(self, row: Mapping[str, Any]) -> bool:
         """Sees a row of the run; returns whether its member is to stop."""
         arm, seed = row["arm"], row["seed"]
-        if arm not in self._trials:  # its end was told before the tuning was stopped
+        if arm not in self._trials:  # it had ended before the tuning was stopped
             return False
         trial, steps = self._trials[arm], row["env_steps"]
         if PRUNED in trial.user_attrs:
