@@ -125,8 +125,10 @@ def bench_scale(
 
 def _split_elsewhere(overrides: Mapping[str, Any], share: int) -> dict[str, float]:
     """`split` in a process that is set up as a training worker is."""
+    device = "gpu" if resolve(overrides).device == "gpu" else "cpu"
     code = (
-        "import json, sys; from sauna.training.worker import configure_jax; configure_jax(); "
+        "import json, sys; from sauna.system.jax_setup import configure_jax; "
+        f"configure_jax(device={device!r}); "
         "from sauna.experiments.bench.split import split; "
         "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))"
     )
