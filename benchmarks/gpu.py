@@ -2,10 +2,14 @@
 
     python benchmarks/gpu.py [--minutes 12]        with an NVIDIA GPU and JAX's CUDA
     python benchmarks/gpu.py --toy --out FILE      every part at toy sizes, on the CPU as well
+    python benchmarks/gpu.py --wheels FOLDER       on a machine that reaches no package index
 
 The most important parts come first. Each has a time limit of its own, and none begins that the
 remaining time does not allow. A part that fails, or whose packages are missing, says so in the
 result and stops nothing.
+
+The wheels of `--wheels` are installed for these runs alone, without what they depend on, so JAX
+stays the machine's. Where there is an index, `pip download --no-deps -d FOLDER PACKAGES` gets them.
 """
 
 from __future__ import annotations
@@ -132,6 +136,15 @@ def run(part: Part, toy: bool, limit: float) -> dict[str, Any]:
     return found
 
 
+def install(wheels: Path, folder: str) -> None:
+    """Installs wheels into a folder, where the parts find them."""
+    files = [str(path) for path in sorted(wheels.glob("*.whl"))]
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
+    subprocess.run([*command, "--target", folder, *files], check=True)
+    paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(paths)
+
+
 def devices() -> str:
     """Names JAX's devices, asked in a process of its own so that no memory stays taken."""
     code = "import jax; print([d.device_kind for d in jax.devices()])"
@@ -145,8 +158,17 @@ def main() -> None:
     parser.add_argument("--toy", action="store_true", help="every part at toy sizes")
     parser.add_argument("--only", default="", help="parts whose name contains this")
     parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--wheels", type=Path, help="a folder of wheels to install first")
     options = parser.parse_args()
     end = time.monotonic() + 60 * options.minutes
+    with tempfile.TemporaryDirectory() as folder:
+        if options.wheels:
+            install(options.wheels, folder)
+        measure(options, end)
+
+
+def measure(options: argparse.Namespace, end: float) -> None:
+    """Runs the parts, most important first, until the clock says `end`."""
     result: dict[str, Any] = {"command": f"python {' '.join(sys.argv)}", "devices": devices()}
     result["parts"] = {}
     print(result["devices"], flush=True)

@@ -70,10 +70,13 @@ def random_rollout(config: Config, spaces: Spaces) -> Rollout:
     normal = lambda *more: rng.normal(size=(*shape, *more)).astype(np.float32)  # noqa: E731
     if spaces.observation_kind == "image":
         observation = rng.integers(0, 256, (*shape, *spaces.observation_shape), np.uint8)
+    else:
+        observation = normal(*spaces.observation_shape)
+    if spaces.action_kind == "discrete":
         action = rng.integers(0, spaces.action_sizes[0], (*shape, 1), np.int32)
         log_prob = np.full(shape, -np.log(spaces.action_sizes[0]), np.float32)
     else:
-        observation, action = normal(*spaces.observation_shape), normal(spaces.action_width)
+        action = normal(spaces.action_width)
         log_prob = (-0.5 * action**2 - 0.5 * np.log(2 * np.pi)).sum(-1)
     no, yes = np.zeros(shape, bool), np.ones(shape, bool)
     columns: Any = (

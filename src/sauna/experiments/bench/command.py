@@ -15,7 +15,7 @@ from typing import Any
 
 from sauna.config.presets import plain, resolve
 from sauna.experiments.bench.peer_settings import LACKS, peer_settings
-from sauna.experiments.bench.peers import peer_rate, prepare, versions
+from sauna.experiments.bench.peers import peer_rate, prepare, script_digest, versions
 from sauna.experiments.bench.rates import (
     WARM_UP,
     alternate,
@@ -87,6 +87,7 @@ def bench(
             "versions": versions(python),
             "settings": settings,
             "measured_without": lacks,
+            **script_digest(script),
         }
         if lacks:
             say(f"{against} is measured without {', '.join(lacks)}, which it does not have")
