@@ -238,15 +238,16 @@ def peer_us(one: dict[str, Any]) -> float:
 def beside_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
     """Where the time goes, by training, and what a peer takes in all."""
     lines = [
-        "| us per env step | environment | normalisation | acting | bookkeeping | update | records | all | the peer, in all | products of the update at the peak |",  # noqa: E501
+        "| us per env step | environment, of it its own `step` or physics | normalisation | acting | bookkeeping | update | records | all | the peer, in all | products of the update at the peak |",  # noqa: E501
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, one in found.items():
         split = one["split"]
         records = sum(split[part] for part in RECORDS)
         each = [split[part] for part in ("normalisation", "inference", "bookkeeping", "update")]
-        each = [environment_us(one), *each, records, sum(split.values()), peer_us(one)]
-        shown = " | ".join(f"{x:.1f}" for x in (*each, products_us(name, peak)))
+        each += [records, sum(split.values()), peer_us(one), products_us(name, peak)]
+        own = f"{split['physics']:.1f}" if split["physics"] else "-"
+        shown = f"{environment_us(one):.1f}, {own} | " + " | ".join(f"{x:.1f}" for x in each)
         lines.append(f"| {_training(one)}, beside {NAMES[one['peer']['name']]} | {shown} |")
     return "\n".join(lines)
 

@@ -83,6 +83,12 @@ def test_sections_add_up_to_a_training_of_a_filtered_arm() -> None:
     assert all(value > 0 for value in found.values()), found
 
 
+def test_the_step_of_an_environment_in_python_is_timed_by_itself() -> None:
+    settings = {"env": "small_envs:Scripted", "arm": "ppo", "rollout_steps": 64, "minibatches": 4}
+    found = split({**settings, "steps": 10**5}, 1)
+    assert found["physics"] > 0 < found["environment"] and found["filter"] == 0
+
+
 @pytest.mark.parametrize("env", ["Hopper-v5", pytest.param("ALE/Pong-v5", marks=pytest.mark.slow)])
 def test_the_simulator_is_measured_through_episode_ends(env: str) -> None:
     assert physics_rate(env, {}, processes=1, seconds=0.05) > 0
