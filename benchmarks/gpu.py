@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).resolve().parent / "results" / "gpu.json"
 LEAST = 20  # seconds below which no part is begun
-TOY_PATIENCE = 5  # times the limit on a CPU, which compiles more slowly
+TOY_PATIENCE = 15  # times the limit on a CPU, which compiles more slowly
 WIDE = ["--hidden", "256,256"]
 TAIL = 600  # characters of a failure's output that are kept
 MISSING = " is not installed"  # what a command says whose packages are missing
