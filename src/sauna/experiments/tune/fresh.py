@@ -178,7 +178,7 @@ def verdict(fresh: Mapping[str, Any]) -> dict[str, Any]:
     text = f"mean final return on fresh seeds: {means}"
     return {
         "believed": believed,
-        "text": text if believed else f"{text}, which is better",
+        "text": text if believed else f"{text}, which is higher",
     }
 
 
