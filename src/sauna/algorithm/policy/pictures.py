@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.policy.convolutions import Layer, convolution, in_pieces, joined
+from sauna.algorithm.policy.convolutions import Layer, convolution
 from sauna.algorithm.policy.networks import Convolution, dense
 from sauna.algorithm.types import Array
 from sauna.envs.pictures import channels_first
@@ -35,13 +35,14 @@ class SmallCNN(nn.Module):
         x, lead = pictures(observation, self.board, self.high)
         for i, features in enumerate((16, 32)):
             layer = Convolution(features, 3, name=f"conv_{i}")(x.shape[-1])
-            x = nn.relu(padded(layer, x))[:, :: i + 1, :: i + 1]
+            x = padded(layer, x, stride=i + 1, rectified=True)
         x = nn.relu(dense(128, math.sqrt(2.0), "dense")(x.reshape((len(x), -1))))
         return x.reshape((*lead, -1))
 
 
 SECTIONS = (16, 32, 32)  # features of each section of IMPALA's network
 BLOCKS = 2  # residual blocks of a section
+PICTURES = 8  # that a CPU takes at a time
 
 
 class ImpalaCNN(nn.Module):
@@ -90,9 +91,10 @@ def pictures(
     return (x.astype(jnp.float32) / high if x.dtype == jnp.uint8 else x), lead
 
 
-def padded(layer: Layer, x: Array) -> Array:
-    """A 3 x 3 convolution `[B, H, W, C]` -> `[B, H, W, F]`, with zeros around the picture."""
-    return convolution(*layer, jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0))), 1)
+def padded(layer: Layer, x: Array, stride: int = 1, rectified: bool = False) -> Array:
+    """A 3 x 3 `convolution` with zeros around the picture: `[B, H, W, F]` at a stride of 1."""
+    around = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    return convolution(*layer, around, stride, rectified)
 
 
 def residual(layers: list[Layer], x: Array) -> Array:
@@ -101,7 +103,7 @@ def residual(layers: list[Layer], x: Array) -> Array:
     for _ in SECTIONS:
         x = nn.max_pool(padded(next(left), x), (3, 3), (2, 2), "SAME")
         for _ in range(BLOCKS):
-            inner = nn.relu(padded(next(left), nn.relu(x)))
+            inner = padded(next(left), nn.relu(x), rectified=True)
             x = x + padded(next(left), inner)
     return nn.relu(x)
 
@@ -112,7 +114,9 @@ def by_pieces(forward: Callable[[Array], Array], x: Array) -> Array:
     The gradient computes a piece anew: all that lies between the layers of a whole minibatch would
     need gigabytes.
     """
-    pieces = in_pieces(x)
-    if len(pieces) == 1:
+    if len(x) <= PICTURES or jax.default_backend() != "cpu":
         return forward(x)
-    return joined(jax.lax.map(jax.checkpoint(forward), pieces), len(x))
+    filled = jnp.pad(x, [(0, -len(x) % PICTURES)] + [(0, 0)] * (x.ndim - 1))
+    pieces = filled.reshape(-1, PICTURES, *x.shape[1:])
+    out = jax.lax.map(jax.checkpoint(forward), pieces)
+    return out.reshape(-1, *out.shape[2:])[: len(x)]
