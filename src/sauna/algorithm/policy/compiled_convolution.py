@@ -6,12 +6,13 @@ their patches stay in the cache.
 
 A compiled JAX program calls these functions by XLA's foreign function interface (`jax.ffi`). XLA
 hands over one pointer, to a call frame that names the buffers. The positions below are those of
-`xla/ffi/api/c_api.h` of jaxlib 0.5 to 0.10, all of major version 0.
+`xla/ffi/api/c_api.h` in jaxlib 0.5.0, 0.6.2, 0.7.2, 0.8.3, 0.9.2 and 0.10.2. A minor version of
+the interface leaves them as they are; XLA refuses to register these functions at another major one.
 """
 
 from __future__ import annotations
 
-import functools
+import threading
 from typing import Any
 
 import jax
@@ -20,37 +21,44 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from sauna.system.compiled import compiled
+from sauna.system.compiled import compiled, compiled_for_c
 
 FORWARD, BACKWARD = "sauna_convolve", "sauna_convolve_back"
-PATCHES = 200_000  # numbers that the cache holds
+PATCHES = 200_000  # numbers of the patches of a turn, which the cache holds
 
-MAJOR = 0  # version of the interface; its minor versions leave the positions as they are
-EXTENSION, INTERFACE, ARGUMENTS, RESULTS = 1, 2, 9, 14  # of a call frame, in words of 8 bytes
-INTERFACE_VERSION = 4  # of the interface: the major version in the low half of the word
-METADATA = 3  # of an extension
-VERSIONS, TRAITS = 3, 4  # of the metadata
-DATA, SHAPE = 3, 5  # of a buffer
+# Positions in words of 8 bytes.
+EXTENSION, INTERFACE, ARGUMENTS, RESULTS = 1, 2, 9, 14  # in a call frame
+VERSION = 4  # in the interface: its major version in the low half of the word, its minor one above
+KIND, METADATA = 1, 3  # in an extension
+ANSWER, TRAITS = 3, 4  # in the metadata: the version, as above, and what the function promises
+DATA, SHAPE = 3, 5  # in a buffer
+
+MAJOR = 0  # version of the interface with these positions
+OLDEST = 1 << 32  # version 0.1: that of jaxlib 0.5 to 0.7, which name none when they ask
+ASKS = 1  # kind of an extension that asks for the metadata
+
+_registered: dict[str, Any] = {}  # the functions, whose machine code must stay
+_one_at_a_time = threading.Lock()
 
 
-@functools.cache
 def register() -> None:
     """Lets compiled programs of this process call `FORWARD` and `BACKWARD`."""
-    for name, function in ((FORWARD, forward), (BACKWARD, backward)):
-        compiled_for_c = numba.cfunc(types.int64(types.CPointer(types.int64)), cache=True)(function)
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(compiled_for_c.ctypes))
-        _kept.append(compiled_for_c)
-
-
-_kept: list[Any] = []  # whose machine code must stay
+    signature = types.int64(types.CPointer(types.int64))
+    with _one_at_a_time:
+        for name, function in ((FORWARD, forward), (BACKWARD, backward)):
+            if name not in _registered:
+                for_c = compiled_for_c(signature, function)
+                jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(for_c.ctypes))
+                _registered[name] = for_c
 
 
 @compiled
 def convolve(kernel: Any, bias: Any, x: Any, stride: int, rectified: int, out: Any) -> None:
-    """Writes `out[B, H', W', F]`: the convolution of x `[B, H, W, C]` without a border.
+    """Writes the convolution of x `[B, H, W, C]` without a border into out `[B, H', W', F]`.
 
     Args:
       kernel: `[K, K, C, F]`; bias: `[F]`.
+      stride: by how many pixels the kernel moves.
       rectified: whether what is negative becomes 0.
     """
     width, features = kernel.shape[0], kernel.shape[3]
@@ -67,7 +75,7 @@ def convolve(kernel: Any, bias: Any, x: Any, stride: int, rectified: int, out: A
         for i in range(len(rows)):
             for j in range(features):
                 value = rows[i, j] + bias[j]
-                rows[i, j] = max(value, np.float32(0.0)) if rectified else value
+                rows[i, j] = np.float32(0.0) if rectified and value < 0.0 else value  # NaN stays
 
 
 @compiled
@@ -82,7 +90,13 @@ def convolve_back(
     of_bias: Any,
     of_x: Any,
 ) -> None:
-    """Writes the gradients of `convolve` by its kernel, its bias and, unless it is empty, x."""
+    """Writes the gradients of `convolve` by its kernel, its bias and its x.
+
+    Args:
+      out, cotangent: `[B, H', W', F]`, what `convolve` wrote, and its gradient.
+      of_kernel: `[K, K, C, F]`; of_bias: `[F]`.
+      of_x: `[B, H, W, C]`, or an empty array, which takes no gradient.
+    """
     width, features = kernel.shape[0], kernel.shape[3]
     inputs = width * width * kernel.shape[2]
     count, pixels = out.shape[0], out.shape[1] * out.shape[2]
@@ -93,8 +107,8 @@ def convolve_back(
     patches = np.empty((pictures * pixels, inputs), np.float32)
     delta = np.empty((pictures * pixels, features), np.float32)
     part = np.empty((inputs, features), np.float32)
+    sums = np.zeros(features)  # double: of each position of each picture
     total[:] = 0.0
-    of_bias[:] = 0.0
     of_x[:] = 0.0
     for first in range(0, count, pictures):
         last = min(first + pictures, count)
@@ -103,7 +117,7 @@ def convolve_back(
             for j in range(features):
                 passes = output[begin + i, j] > 0.0 or not rectified
                 delta[i, j] = arriving[begin + i, j] if passes else np.float32(0.0)
-                of_bias[j] += delta[i, j]
+                sums[j] += delta[i, j]
         unfold(x, first, last, width, stride, out.shape[1], out.shape[2], patches)
         np.dot(patches[:n].T, delta[:n], part)
         for i in range(inputs):
@@ -112,19 +126,26 @@ def convolve_back(
         if of_x.size:
             np.dot(delta[:n], weights.T, patches[:n])
             fold(patches, first, last, width, stride, out.shape[1], out.shape[2], of_x)
+    of_bias[:] = sums
 
 
 @compiled
 def of_a_turn(numbers: int, count: int) -> int:
     """How many of `count` pictures, each with patches of so many numbers, take a turn together."""
-    return min(max(PATCHES // numbers, 1), count)
+    return max(min(PATCHES // numbers, count), 1)
 
 
 @compiled
 def unfold(
     x: Any, first: int, last: int, width: int, stride: int, rows: int, columns: int, patches: Any
 ) -> None:
-    """Writes the patches of the pictures from `first` on, one row for each position."""
+    """Writes a row of `patches` for each position of the kernel in x from picture `first` on.
+
+    Args:
+      x: `[B, H, W, C]`.
+      width: K, the kernel's; rows, columns: H' and W', how many positions there are.
+      patches: `[(last - first) * H' * W', K * K * C]`, or more rows, which stay as they are.
+    """
     run = width * x.shape[3]  # numbers beside each other in a picture
     step = stride * x.shape[3]
     lines, numbers = x.reshape(x.shape[0] * x.shape[1], -1), patches.reshape(-1)
@@ -144,7 +165,7 @@ def unfold(
 def fold(
     patches: Any, first: int, last: int, width: int, stride: int, rows: int, columns: int, x: Any
 ) -> None:
-    """Adds each row of `patches` to the pixels that `unfold` took it from."""
+    """Adds each row of `patches` to the pixels of x that `unfold` takes it from."""
     run = width * x.shape[3]
     step = stride * x.shape[3]
     lines, numbers = x.reshape(x.shape[0] * x.shape[1], -1), patches.reshape(-1)
@@ -196,11 +217,12 @@ def pictures(address: Any) -> Any:
 @compiled
 def asks_for_the_version(frame: Any) -> bool:
     """Whether XLA does not call yet, but asks what the function was written for; answers that."""
-    if frame[EXTENSION] == 0:
+    extension = words(frame[EXTENSION])
+    if frame[EXTENSION] == 0 or np.int32(extension[KIND]) != ASKS:
         return False
-    metadata = words(words(frame[EXTENSION])[METADATA])
-    here = words(frame[INTERFACE])[INTERFACE_VERSION]
-    metadata[VERSIONS] = here if np.int32(here) == MAJOR else MAJOR  # which XLA then refuses
+    here = words(frame[INTERFACE])[VERSION] if frame[INTERFACE] else OLDEST
+    metadata = words(extension[METADATA])
+    metadata[ANSWER] = here if np.int32(here) == MAJOR else OLDEST  # which XLA then refuses
     metadata[TRAITS] = 0
     return True
 

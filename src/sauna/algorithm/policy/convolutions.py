@@ -20,27 +20,28 @@ LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # features, width of the kernel, 
 Layer = tuple[Array, Array]  # kernel [K, K, C, F], bias [F]
 
 
-def convolutions(layers: list[Layer], x: Array) -> Array:
+def convolutions(layers: list[Layer], x: Array, high: float = 255.0) -> Array:
     """`[B, H, W, C]` -> `[B, H', W', 64]`: each of `LAYERS`, and a ReLU."""
     for layer, (_, _, stride) in zip(layers, LAYERS, strict=True):
-        x = convolution(*layer, x, stride, rectified=True)
+        x = convolution(*layer, x, stride, rectified=True, high=high)
     return x
 
 
 def convolution(
-    kernel: Array, bias: Array, x: Array, stride: int, rectified: bool = False
+    kernel: Array, bias: Array, x: Array, stride: int, rectified: bool = False, high: float = 255.0
 ) -> Array:
     """A convolution without a border, `[B, H, W, C]` -> `[B, H', W', F]`.
 
     Args:
       kernel: `[K, K, C, F]`; bias: `[F]`.
-      x: float32, or bytes, which are scaled to [0, 1] and have no gradient.
+      x: numbers, or bytes, which are divided by `high` and have no gradient.
       stride: by how many pixels the kernel moves.
       rectified: whether a ReLU follows.
     """
     of_bytes = x.dtype == jnp.uint8
+    x = x.astype(jnp.float32)
     if of_bytes:
-        x = x.astype(jnp.float32) / 255.0
+        x = x / high
     if jax.default_backend() == "cpu":
         return _by_patches(kernel, bias, x, stride, rectified, not of_bytes)
     axes = ("NHWC", "HWIO", "NHWC")
@@ -52,7 +53,11 @@ def convolution(
 def _by_patches(
     kernel: Array, bias: Array, x: Array, stride: int, rectified: bool, of_x: bool
 ) -> Array:
-    """`convolution` by `compiled_convolution`; without a gradient of x unless `of_x`."""
+    """`convolution` by `compiled_convolution`, whose buffers are float32.
+
+    Args:
+      of_x: whether x has a gradient.
+    """
     compiled_convolution.register()
     side = [(n - kernel.shape[0]) // stride + 1 for n in x.shape[1:3]]
     out = jax.ShapeDtypeStruct((len(x), *side, kernel.shape[-1]), jnp.float32)

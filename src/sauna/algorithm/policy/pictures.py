@@ -32,10 +32,10 @@ class SmallCNN(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        x, lead = pictures(observation, self.board, self.high)
+        x, lead = pictures(observation, self.board)
         for i, features in enumerate((16, 32)):
             layer = Convolution(features, 3, name=f"conv_{i}")(x.shape[-1])
-            x = padded(layer, x, stride=i + 1, rectified=True)
+            x = padded(layer, x, stride=i + 1, rectified=True, high=self.high)
         x = nn.relu(dense(128, math.sqrt(2.0), "dense")(x.reshape((len(x), -1))))
         return x.reshape((*lead, -1))
 
@@ -60,13 +60,13 @@ class ImpalaCNN(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        x, lead = pictures(observation, self.board, self.high)
+        x, lead = pictures(observation, self.board)
         layers, channels = [], x.shape[-1]
         for i, features in enumerate(SECTIONS):
             for j in range(1 + 2 * BLOCKS):
                 layers.append(Convolution(features, 3, name=f"conv_{i}_{j}")(channels))
                 channels = features
-        x = by_pieces(lambda x: residual(layers, x), x)
+        x = by_pieces(lambda x: residual(layers, x, self.high), x)
         x = nn.relu(dense(256, math.sqrt(2.0), "dense")(x.reshape((len(x), -1))))
         return x.reshape((*lead, -1))
 
@@ -77,10 +77,8 @@ PICTURE_NETWORKS: dict[str, type[SmallCNN | ImpalaCNN]] = {
 }
 
 
-def pictures(
-    observation: Array, board: tuple[int, ...], high: float
-) -> tuple[Array, tuple[int, ...]]:
-    """Observations as `[B, H, W, C]` float32, bytes divided by `high`; and their leading axes."""
+def pictures(observation: Array, board: tuple[int, ...]) -> tuple[Array, tuple[int, ...]]:
+    """Observations as `[B, H, W, C]`, and their leading axes."""
     axes = 1 if board else 3
     lead, x = observation.shape[:-axes], observation
     x = x.reshape((-1, *(board or x.shape[-3:])))
@@ -88,20 +86,22 @@ def pictures(
         x = x[..., None]
     elif channels_first(board):
         x = jnp.moveaxis(x, 1, -1)
-    return (x.astype(jnp.float32) / high if x.dtype == jnp.uint8 else x), lead
+    return x, lead
 
 
-def padded(layer: Layer, x: Array, stride: int = 1, rectified: bool = False) -> Array:
+def padded(
+    layer: Layer, x: Array, stride: int = 1, rectified: bool = False, high: float = 255.0
+) -> Array:
     """A 3 x 3 `convolution` with zeros around the picture: `[B, H, W, F]` at a stride of 1."""
     around = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    return convolution(*layer, around, stride, rectified)
+    return convolution(*layer, around, stride, rectified, high)
 
 
-def residual(layers: list[Layer], x: Array) -> Array:
+def residual(layers: list[Layer], x: Array, high: float) -> Array:
     """The sections of `ImpalaCNN`, `[B, H, W, C]` -> `[B, H', W', 32]`, and a ReLU."""
     left = iter(layers)
     for _ in SECTIONS:
-        x = nn.max_pool(padded(next(left), x), (3, 3), (2, 2), "SAME")
+        x = nn.max_pool(padded(next(left), x, high=high), (3, 3), (2, 2), "SAME")
         for _ in range(BLOCKS):
             inner = padded(next(left), nn.relu(x), rectified=True)
             x = x + padded(next(left), inner)
