@@ -385,6 +385,6 @@ def _failure(run: Path, header: dict[str, Any]) -> SaunaError:
 
 def _environment(config: Config) -> dict[str, str]:
     """Lists what a worker's JAX has to know before it is imported."""
-    if config.backend == "device" and config.device == "gpu":
+    if config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
     return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}

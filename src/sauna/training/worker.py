@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
@@ -97,7 +97,8 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     try:
         header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
-        configure_jax(header["config"]["devices"], _device(header["config"]))
+        config = header["config"]
+        configure_jax(config["devices"], "gpu" if config["device"] == "gpu" else "cpu")
         reporter = PipeReporter(inbox, outbox, dies_alone)
         train_members(read_job(header, arrays), reporter)
         send(outbox, {"kind": "done"})
@@ -127,10 +128,6 @@ def train_members(job: Job, reporter: Reporter) -> None:
         from sauna.training.loop.host import train_on_host
 
         train_on_host(job, reporter)
-
-
-def _device(config: Mapping[str, Any]) -> str:
-    return "gpu" if config["backend"] == "device" and config["device"] == "gpu" else "cpu"
 
 
 def write_job(
