@@ -1,4 +1,4 @@
-"""Two searches by `sauna tune` from a poor start, and populations beside random searches.
+"""Searches by `sauna tune` from a poor start, and populations beside random searches.
 
     python results/tune.py              trains what is missing under runs/, then writes the numbers
     python results/tune.py --collect    adds what runs/ holds to `results/tune.json`

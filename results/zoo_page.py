@@ -26,7 +26,7 @@ WORDS = {
     "the goal in 2 of its 20 episodes.",
     "MiniGrid-Unlock-v0": f"{SAMPLED} With the most likely actions, one seed does not reach the "
     "goal in 4 of its 20 episodes.",
-    "Swimmer-v5": "preset `mujoco` has a discount of 0.99; RL Zoo's is 0.9999.",
+    "Swimmer-v5": "RL Zoo's policy also sees the time that is left of an episode.",
 }
 
 

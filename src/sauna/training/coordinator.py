@@ -387,4 +387,5 @@ def _environment(config: Config) -> dict[str, str]:
     """Lists what a worker's JAX has to know before it is imported."""
     if config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
-    return {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+    one = dict.fromkeys(("PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    return {**one, "JAX_PLATFORMS": "cpu"}
