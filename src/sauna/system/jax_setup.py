@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import sys
 
+# What a worker's JAX on the CPU has to know before it is imported.
+ON_CPU = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+
 
 def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
     """One CPU thread per process, synchronous dispatch, and a compilation cache on disk.

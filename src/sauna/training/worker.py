@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import threading
@@ -63,6 +64,8 @@ class PipeReporter:
         send(self._outbox, {"kind": "phase", "text": text})
 
     def allowance(self, iteration: int) -> int:
+        if self._dies_alone:
+            gc.enable()  # the first iteration begins
         with self._changed:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
             return max(self._granted - iteration, 0)
@@ -95,8 +98,10 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     if dies_alone:
         threading.Thread(target=_send_heartbeats, args=(outbox,), daemon=True).start()
     try:
-        header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
+        if dies_alone:
+            _import_ahead()
+        header, arrays = receive(inbox)
         configure_jax(header["config"]["devices"], _device(header["config"]))
         reporter = PipeReporter(inbox, outbox, dies_alone)
         train_members(read_job(header, arrays), reporter)
@@ -110,6 +115,14 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     except Exception as error:
         header = {"kind": "failure", "message": f"training raised {one_line(error)}"}
         send(outbox, {**header, **describe_failure(error, not dies_alone)})
+
+
+def _import_ahead() -> None:
+    """Imports what every training needs, while the parent may still find out what this one is."""
+    configure_jax()
+    import sauna.algorithm.learner.program
+    import sauna.training.loop.evaluation
+    import sauna.training.loop.metrics  # noqa: F401
 
 
 def train_members(job: Job, reporter: Reporter) -> None:
@@ -170,6 +183,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
 
 
 def main() -> None:
+    gc.disable()  # what is imported and compiled stays; see `PipeReporter.allowance`
     inbox, outbox = child_ends(sys.argv[1:])
     serve(inbox, outbox, dies_alone=True)
 

@@ -156,6 +156,7 @@ def several(
     Returns:
       the state, and reports with a leading axis `[MAX_PER_CALL]`, `ran` False where none is.
     """
+    iterate = jax.jit(iterate, inline=True)  # traced once, for the shapes and for the loop
     shapes = jax.eval_shape(iterate, state, setting, first)[1]
     empty = jax.tree.map(lambda x: jnp.zeros((MAX_PER_CALL, *x.shape), x.dtype), shapes)
 
