@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from pathlib import Path
 
 import pytest
 
-from sauna.system.put_off import put_off
+from sauna.system.imports import put_off, uncollected
 from sauna.system.spawn import Spawned, spawn, spawned_ahead
 
 WAITS = "import os, sys\nos.read(int(sys.argv[1]), 1)\n"  # until its parent closes the pipe
@@ -91,3 +92,15 @@ def test_a_module_that_is_put_off_is_imported_at_its_first_use(
         assert sys.modules["drawing"] is drawing, "it is imported already"
     for name in ("draws", "drawing", "drawing.lines"):
         monkeypatch.delitem(sys.modules, name)
+
+
+def test_garbage_is_collected_again_after_a_block_of_imports_if_it_was_before() -> None:
+    for collects in (True, False):
+        (gc.enable if collects else gc.disable)()
+        try:
+            with pytest.raises(KeyError), uncollected():
+                assert not gc.isenabled()
+                raise KeyError
+            assert gc.isenabled() == collects
+        finally:
+            gc.enable()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import os
 import sys
 import threading
@@ -27,6 +28,12 @@ if TYPE_CHECKING:
     from sauna.training.loop.job import Job, Reporter
 
 HEARTBEAT = 2.0  # seconds between two
+AHEAD = (  # what every training imports
+    "sauna.algorithm.learner.program",
+    "sauna.training.loop.evaluation",
+    "sauna.training.loop.metrics",
+    "scipy.linalg",  # by JAX, for the first orthogonal matrix
+)
 
 
 class PipeReporter:
@@ -118,11 +125,10 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
 
 
 def _import_ahead() -> None:
-    """Imports what every training needs, while the parent may still find out what this one is."""
+    """Imports what a training needs, while the parent may still find out what this one is."""
     configure_jax()
-    import sauna.algorithm.learner.program
-    import sauna.training.loop.evaluation
-    import sauna.training.loop.metrics  # noqa: F401
+    for name in AHEAD:
+        importlib.import_module(name)
 
 
 def train_members(job: Job, reporter: Reporter) -> None:

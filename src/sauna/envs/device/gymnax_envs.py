@@ -10,7 +10,7 @@ import numpy as np
 
 from sauna.envs.device.contract import JaxEnv, Transition
 from sauna.system.errors import BadInput
-from sauna.system.put_off import put_off
+from sauna.system.imports import put_off
 
 # gymnax imports them for its own pictures, and that takes longer than all the rest of it.
 with put_off("matplotlib", "matplotlib.colors", "matplotlib.pyplot", "seaborn"):
