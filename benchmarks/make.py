@@ -15,8 +15,12 @@ import sys
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
+from sauna.config.choices import PEER_SCRIPTS
+from sauna.experiments.bench.command import RECORDS
+from sauna.experiments.bench.peer_settings import READ
 from sauna.experiments.bench.rates import alternate, ratio, training_rate
 from sauna.experiments.bench.scale import draw
 from sauna.system import run_directory
@@ -42,6 +46,20 @@ MEASURED = {
         "--iterations",
         "10",
     ],
+    # A rule that takes half of the samples, beside Stable-Baselines3 with all of them.
+    "pong_half": shlex.split(
+        "ALE/Pong-v5 --preset atari --arm top-advantage --sampler-kwargs '{\"share\": 0.5}' "
+        "--seeds 1 --against sb3 --rounds 5 --iterations 10"
+    ),
+    # One seed whose environments are stepped by two worker processes.
+    "own_slow_workers": shlex.split(
+        "own_envs:Reach --env-kwargs '{\"milliseconds\": 1}' --seeds 1 --envs 2 --env-processes 2 "
+        "--minibatches 64 --against sb3 --rounds 5 --iterations 3"
+    ),
+}
+LABELS = {
+    "pong_half": ", half of the samples",
+    "own_slow_workers": ", 1 ms a step, 2 environment workers",
 }
 # Environments written in Python, and wide networks: one seed per core. BipedalWalker's preset has
 # four times as many samples in a rollout, with minibatches of 64, too; that would take an hour.
@@ -85,6 +103,8 @@ FAST = {
     "pole_purejaxrl": [*_POLE, "--against", "purejaxrl"],
     "breakout_purejaxrl": [*_BREAKOUT, "--against", "purejaxrl"],
 }
+# Whose products are counted by `peak.py`: what bounds a ratio.
+BOUNDED = (*OTHERS, *FAST, "pong_1", "pong_half", "own_slow_workers")
 # Needs a copy of CleanRL's script: `sauna bench HalfCheetah-v5 --seeds 1 --against cleanrl
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
 BY_HAND = ["cheetah_1_cleanrl"]
@@ -97,6 +117,17 @@ NAMES = {
     "rejax": "rejax",
     "purejaxrl": "PureJaxRL's script",
 }
+# What is not equal beside the settings in the last column of the tables: a peer's code says more.
+NOT_EQUAL = {
+    "sb3": "It steps Gymnasium's environments in `DummyVecEnv`, Atari through its own wrappers.",
+    "cleanrl": "It has numbers of its own: those of our preset `mujoco`. A time limit is an end.",
+    "rltools": "Its tanh is an approximation, its Adam's epsilon 1e-7, an action is not clipped.",
+    "rl_games": "It normalises values and not rewards, advantages over a rollout; it clips "
+    "observations at 5; its Adam's epsilon is 1e-8; MuJoCo is EnvPool's.",
+    "rejax": "gymnax is older; a time limit is an end; each element of a gradient is clipped; "
+    "its Adam's epsilon is 1e-8.",
+    "purejaxrl": "gymnax is older; a time limit is an end; it returns each step's episode.",
+}
 FILTERED = {
     "ppo": {"arm": "ppo"},
     "sauna, threshold 0.8": {"arm": "sauna", "threshold": 0.8},
@@ -104,14 +135,15 @@ FILTERED = {
 }
 
 
+def flags_of_all() -> dict[str, list[str]]:
+    """The flags of `sauna bench` by result file."""
+    beside = {name: [*own, *_BESIDE] for name, own in OTHERS.items()}
+    return {**MEASURED, **beside, **FAST}
+
+
 def measure(names: Sequence[str]) -> None:
     """Measures what is named, or all; from the folder in which `own_envs.py` is found."""
-    flags = {
-        **MEASURED,
-        **{name: [*own, *_BESIDE] for name, own in OTHERS.items()},
-        **FAST,
-        "scale": ["--scale"],
-    }
+    flags = {**flags_of_all(), "scale": ["--scale"]}
     for name in names or (*flags, "filtered"):
         if name == "filtered":
             measure_filtered()
@@ -170,11 +202,11 @@ def others_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
         rates, own = sorted(one["rates"]["training"]), one["peer"]["settings"]
         env = one["env"] + (", 1 ms a step" if "milliseconds" in own["env_kwargs"] else "")
         network = "-".join(map(str, own["hidden"]))
-        stepping = one["split"]["environment"] + one["split"]["physics"]
         lines.append(
             f"| {env} | {own['envs']} x {own['rollout_steps']}, {own['epochs']}, {network} | "
             f"{rates[len(rates) // 2]:,.0f} | {_peer(one)} | "
-            f"{stepping / sum(one['split'].values()):.0%} | {most_over_peer(name, one, peak):.1f} |"
+            f"{environment_us(one) / sum(one['split'].values()):.0%} | "
+            f"{most_over_peer(name, one, peak):.1f} |"
         )
     return "\n".join(lines)
 
@@ -182,20 +214,96 @@ def others_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
 def most_over_peer(name: str, one: dict[str, Any], peak: dict[str, Any]) -> float:
     """The ratio over the peer of a trainer that only steps the environment and multiplies the
     update's matrices at this machine's peak."""
+    return peer_us(one) / (environment_us(one) + products_us(name, peak))
+
+
+def products_us(name: str, peak: dict[str, Any]) -> float:
+    """What the products of an env step's update take at the peak."""
     gflops = max(network["peak_gflops"] for network in peak["networks"])
-    products = peak["operations_of_an_env_step"][name] / (1e3 * gflops)
-    least = one["split"]["environment"] + one["split"]["physics"] + products
-    peer = sorted(one["rates"][one["peer"]["name"]])
-    return 1e6 * one["processes"] / (peer[len(peer) // 2] * least)
+    return float(peak["operations_of_an_env_step"][name] / (1e3 * gflops))
 
 
-def fast_table(found: dict[str, dict[str, Any]]) -> str:
+def environment_us(one: dict[str, Any]) -> float:
+    """What an env step takes of the environment alone."""
+    if "split" in one:
+        return float(one["split"]["environment"] + one["split"]["physics"])
+    return 1e6 / median(one["rates"]["physics"])
+
+
+def peer_us(one: dict[str, Any]) -> float:
+    """What an env step takes a process of the peer."""
+    return 1e6 * one.get("processes", 1) / median(one["rates"][one["peer"]["name"]])
+
+
+def beside_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
+    """Where the time goes, by training, and what a peer takes in all."""
+    lines = [
+        "| us per env step | environment, of it its own `step` or physics | normalisation | acting | bookkeeping | update | records | all | the peer, in all | products of the update at the peak |",  # noqa: E501
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, one in found.items():
+        split = one["split"]
+        records = sum(split[part] for part in RECORDS)
+        each = [split[part] for part in ("normalisation", "inference", "bookkeeping", "update")]
+        each += [records, sum(split.values()), peer_us(one), products_us(name, peak)]
+        own = f"{split['physics']:.1f}" if split["physics"] else "-"
+        shown = f"{environment_us(one):.1f}, {own} | " + " | ".join(f"{x:.1f}" for x in each)
+        lines.append(f"| {_training(one)}, beside {NAMES[one['peer']['name']]} | {shown} |")
+    return "\n".join(lines)
+
+
+def device_beside_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
+    """The same of environments on the device, whose parts are timed each by itself."""
+    lines = [
+        "| us per env step | environment | collecting | update | all | the peer, in all | products of the update at the peak |",  # noqa: E501
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, one in found.items():
+        each = [1e6 / median(one["rates"][part]) for part in ("physics", "collect", "update")]
+        each += [1e6 / median(one["rates"]["whole"]), peer_us(one), products_us(name, peak)]
+        shown = " | ".join(f"{x:.2f}" for x in each)
+        lines.append(f"| {one['env']}, beside {NAMES[one['peer']['name']]} | {shown} |")
+    return "\n".join(lines)
+
+
+def _training(one: dict[str, Any]) -> str:
+    """What was trained, by its environment and network."""
+    settings = one["peer"]["settings"]
+    env = one["env"] + (", 1 ms a step" if "milliseconds" in settings["env_kwargs"] else "")
+    if one["env"].startswith("ALE/"):
+        return f"{env}, {', '.join(one['arm'])}"
+    return f"{env}, {'-'.join(map(str, settings['hidden']))}"
+
+
+def peers_table(found: dict[str, dict[str, Any]]) -> str:
+    """Each peer once: its version, the settings that are held equal, and what is not equal."""
+    lines = ["| peer | versions | held equal | not equal |", "|---|---|---|---|"]
+    peers = {one["peer"]["name"]: one["peer"] for one in found.values() if "peer" in one}
+    for name, peer in peers.items():
+        versions = {n.replace("_", "-"): v for n, v in peer["versions"].items() if n != "python"}
+        shown = ", ".join(f"{n} {v}" for n, v in versions.items())
+        if name in PEER_SCRIPTS:
+            shown += f", its `{PEER_SCRIPTS[name]}` {peer.get('script', 'of no noted revision')}"
+        equal = ", ".join(map(_named, (n for n in READ[name] if n != "env")))
+        lines.append(f"| {NAMES[name]} | {shown} | {equal or '-'} | {NOT_EQUAL[name]} |")
+    return "\n".join(lines)
+
+
+def commands_table(names: Iterable[str]) -> str:
+    lines = ["| NAME | `sauna bench` with |", "|---|---|"]
+    every = flags_of_all()
+    return "\n".join(
+        [*lines, *(f"| {n} | `{shlex.join(every[n])}` |" for n in names if n in every)]
+    )
+
+
+def fast_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
     """Beside peers that are known as fast, with what they are measured without."""
     lines = [
-        "| peer | PPO on | envs x steps, minibatches, epochs, network | env steps/s: ours, theirs | ratio | measured without |",  # noqa: E501
-        "|---|---|---|---|---|---|",
+        "| peer | PPO on | envs x steps, minibatches, epochs, network | env steps/s: ours, theirs | ratio | no trainer can exceed | measured without |",  # noqa: E501
+        "|---|---|---|---|---|---|---|",
     ]
-    for one in found.values():
+    for name, one in found.items():
         peer, own = one["peer"], one["peer"]["settings"]
         ours = sorted(one["rates"].get("training") or one["rates"]["whole"])
         theirs = sorted(one["rates"][peer["name"]])
@@ -205,9 +313,13 @@ def fast_table(found: dict[str, dict[str, Any]]) -> str:
             f"| {NAMES[peer['name']]} {version}".rstrip() + f" | {one['env']} | "
             f"{own['envs']} x {own['rollout_steps']}, {own['minibatches']}, {own['epochs']}, "
             f"{'-'.join(map(str, own['hidden']))} | {_middle(ours)}, {_middle(theirs)} | "
-            f"{_ratio(one, peer['name'])} | {without} |"
+            f"{_ratio(one, peer['name'])} | {most_over_peer(name, one, peak):.1f} | {without} |"
         )
     return "\n".join(lines)
+
+
+def _dashed(widths: Sequence[int]) -> str:
+    return "-".join(map(str, widths))
 
 
 def _named(field: str) -> str:
@@ -221,21 +333,20 @@ def _middle(rates: Sequence[float]) -> str:
 def peak_table(peak: dict[str, Any]) -> str:
     """How close an update comes to the machine's peak."""
     lines = [
-        "| network | operations of a sample, thousands | peak, GFLOP/s | the update, of the peak | its products alone, of the peak | a gradient step beyond its products, us |",  # noqa: E501
-        "|---|---|---|---|---|---|",
+        "| update | network | samples of a minibatch | operations of a sample, thousands | peak, GFLOP/s | the update, of the peak | its products alone, of the peak | a gradient step, us: all, beyond its products, its optimiser |",  # noqa: E501
+        "|---|---|---|---|---|---|---|---|",
     ]
     for one in peak["networks"]:
-        beyond = (one["update_seconds"] - one["products_seconds"]) / one["gradient_steps"]
+        network = one["hidden"]
+        parts = [one[f"{part}_seconds"] for part in ("update", "products", "optimiser")]
+        update, products, optimiser = (1e6 * part / one["gradient_steps"] for part in parts)
         lines.append(
-            f"| {'-'.join(map(str, one['hidden']))} | {one['operations_of_a_sample'] / 1e3:.0f} | "
+            f"| {one['of']} | {network if isinstance(network, str) else _dashed(network)} | "
+            f"{one['samples_of_a_minibatch']} | {one['operations_of_a_sample'] / 1e3:,.0f} | "
             f"{one['peak_gflops']:.0f} | {one['update_of_peak']:.2f} | "
-            f"{one['products_of_peak']:.2f} | {1e6 * beyond:.0f} |"
+            f"{one['products_of_peak']:.2f} | "
+            f"{update:,.0f}, {update - products:,.0f}, {optimiser:,.0f} |"
         )
-    cnn, gflops = peak["nature_cnn"], max(one["peak_gflops"] for one in peak["networks"])
-    lines.append(
-        f"| Nature CNN, Pong | {cnn['operations_of_a_sample'] / 1e3:,.0f} | {gflops:.0f} | "
-        f"{cnn['update_of_peak']:.2f} | - | - |"
-    )
     return "\n".join(lines)
 
 
@@ -263,9 +374,9 @@ def rates_table(found: dict[str, dict[str, Any]]) -> str:
         "| | processor | env steps/s, in sum | of the simulator alone | of another trainer | first env step | memory of a process |",  # noqa: E501
         "|---|---|---|---|---|---|---|",
     ]
-    for one in found.values():
+    for name, one in found.items():
         rates = sorted(one["rates"]["training"])
-        what = f"{one['env']}, {', '.join(one['arm'])}, {one['members']} "
+        what = f"{one['env']}{LABELS.get(name, '')}, {', '.join(one['arm'])}, {one['members']} "
         what += "seed" if one["members"] == 1 else "seeds"
         what += f", {one['processes']} process" + ("es" if one["processes"] > 1 else "")
         lines.append(
@@ -326,9 +437,11 @@ def split_table(found: dict[str, dict[str, Any]]) -> str:
     found = {name: one for name, one in found.items() if name not in BY_HAND}
     names = list(next(iter(found.values()))["split"])
     head = []
-    for one in found.values():
+    for name, one in found.items():
         members = -(-one["members"] // one["processes"])
-        head.append(f"{one['env']}, {members} member" + ("s" if members > 1 else ""))
+        head.append(
+            f"{one['env']}{LABELS.get(name, '')}, {members} member" + ("s" if members > 1 else "")
+        )
     lines = [f"| us per env step | {' | '.join(head)} |", "|---|" + "---|" * len(head)]
     for name in names:
         values = [f"{one['split'][name]:.2f}" for one in found.values()]
@@ -373,6 +486,10 @@ def insert(path: Path, name: str, text: str) -> None:
     path.write_text(f"{head}{begin}\n{text}\n{end}{rest.split(end)[1]}")
 
 
+def _on_the_device() -> dict[str, dict[str, Any]]:
+    return {name: one for name, one in stored(FAST).items() if "split" not in one}
+
+
 def main() -> None:
     os.chdir(ROOT)
     if "--measure" in sys.argv:
@@ -386,9 +503,14 @@ def main() -> None:
     insert(page, "others", f"{measured_on(others)}\n\n{others_table(others, peak)}")
     insert(page, "peak", peak_table(peak))
     if fast := stored(FAST):
-        insert(page, "fast", f"{measured_on(fast)}\n\n{fast_table(fast)}")
+        insert(page, "fast", f"{measured_on(fast)}\n\n{fast_table(fast, peak)}")
     insert(page, "startup", startup_table(json.loads((RESULTS / "startup.json").read_text())))
     insert(page, "split", split_table(found))
+    beside = {name: one for name, one in stored(BOUNDED).items() if "split" in one}
+    insert(page, "beside", beside_table(beside, peak))
+    insert(page, "device", device_beside_table(_on_the_device(), peak))
+    insert(page, "peers", peers_table(stored([*BY_HAND, *flags_of_all()])))
+    insert(page, "commands", commands_table(stored(flags_of_all())))
     filtered = RESULTS / "filtered.json"
     if filtered.exists():
         insert(page, "filtered", filtered_table(json.loads(filtered.read_text())))

@@ -1,4 +1,4 @@
-"""Environments as a user writes them, for `benchmarks/python_envs.py`."""
+"""Environments as a user writes them, for `benchmarks/make.py`."""
 
 from __future__ import annotations
 

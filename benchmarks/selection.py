@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -25,8 +26,10 @@ from typing import Any
 import numpy as np
 
 from sauna.system.jax_setup import configure_jax
+from sauna.training.prepare import has_gpu
 
-configure_jax()
+# `--wall` is for a GPU, if there is one.
+configure_jax(device="gpu" if "--wall" in sys.argv and has_gpu() else "cpu")
 
 import jax  # noqa: E402
 from turns import Trainer, in_turn  # noqa: E402
@@ -67,10 +70,13 @@ def random_rollout(config: Config, spaces: Spaces) -> Rollout:
     normal = lambda *more: rng.normal(size=(*shape, *more)).astype(np.float32)  # noqa: E731
     if spaces.observation_kind == "image":
         observation = rng.integers(0, 256, (*shape, *spaces.observation_shape), np.uint8)
+    else:
+        observation = normal(*spaces.observation_shape)
+    if spaces.action_kind == "discrete":
         action = rng.integers(0, spaces.action_sizes[0], (*shape, 1), np.int32)
         log_prob = np.full(shape, -np.log(spaces.action_sizes[0]), np.float32)
     else:
-        observation, action = normal(*spaces.observation_shape), normal(spaces.action_width)
+        action = normal(spaces.action_width)
         log_prob = (-0.5 * action**2 - 0.5 * np.log(2 * np.pi)).sum(-1)
     no, yes = np.zeros(shape, bool), np.ones(shape, bool)
     columns: Any = (
@@ -165,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--only", default="", help="cases whose name contains this")
-    parser.add_argument("--wall", action="store_true", help="time by the wall, as on a GPU")
+    parser.add_argument("--wall", action="store_true", help="time by the wall; on a GPU, if any")
     parser.add_argument("--out", type=Path, help=f"default: {PATH.name}; what is there stays")
     options = parser.parse_args()
     rounds, path = options.rounds, options.out or PATH
@@ -177,6 +183,8 @@ def main() -> None:
         cases["Pong, whole training"] = partial(measure_pong, rounds)
     result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     result["command"] = "python benchmarks/selection.py" + " --wall" * options.wall
+    if options.wall:
+        result["device"] = jax.devices()[0].device_kind
     for name, measured in cases.items():
         if options.only in name:
             result[name] = {"rounds": rounds, **measured()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import runpy
 import sys
@@ -13,7 +14,7 @@ import pytest
 
 from sauna import cli
 from sauna.config.presets import resolve
-from sauna.experiments.bench import command, peer_jax, scale
+from sauna.experiments.bench import command, device, peer_jax, scale
 from sauna.experiments.bench.peer_settings import GYMNAX_PEERS, peer_settings
 from sauna.experiments.bench.peers import peer_rate
 from sauna.experiments.bench.rates import Clock, alternate, physics_rate, ratio, simulator
@@ -80,6 +81,12 @@ def test_sections_add_up_to_a_training_of_a_filtered_arm() -> None:
     found = split(settings, 2)
     assert tuple(found) == SECTIONS
     assert all(value > 0 for value in found.values()), found
+
+
+def test_the_step_of_an_environment_in_python_is_timed_by_itself() -> None:
+    settings = {"env": "small_envs:Scripted", "arm": "ppo", "rollout_steps": 64, "minibatches": 4}
+    found = split({**settings, "steps": 10**5}, 1)
+    assert found["physics"] > 0 < found["environment"] and found["filter"] == 0
 
 
 @pytest.mark.parametrize("env", ["Hopper-v5", pytest.param("ALE/Pong-v5", marks=pytest.mark.slow)])
@@ -315,6 +322,17 @@ def test_purejaxrls_script_is_run_with_the_settings_of_the_run(tmp_path, monkeyp
     assert config["TOTAL_TIMESTEPS"] == peer_jax.FEW * 64 * 128
     assert (config["NUM_MINIBATCHES"], config["UPDATE_EPOCHS"], config["LR"]) == (8, 4, 5e-3)
     assert config["ANNEAL_LR"] is True
+
+
+def test_a_result_names_the_revision_of_a_peers_script(tmp_path, monkeypatch) -> None:
+    script = tmp_path / "ppo.py"
+    script.write_text(SCRIPT)
+    monkeypatch.setattr(device, "prepare", lambda peer, say: Path(sys.executable))
+    monkeypatch.setattr(device, "versions", lambda python: {})
+    config = resolve({**MINATAR, "device": "cpu"})
+    _, about = device._gymnax_peer("purejaxrl", config, script, print)
+    assert about["script"] == hashlib.sha256(SCRIPT.encode()).hexdigest()[:12]
+    assert "script" not in device._gymnax_peer("rejax", config, None, print)[1]
 
 
 def test_rejax_is_created_with_the_settings_of_the_run(monkeypatch) -> None:

@@ -251,7 +251,7 @@ def wrong_on_device(rng: random.Random) -> Mistake:
     del jax_envs
     only, count = "only read with backend device", rng.randrange(1, 9)
     at_once = [
-        Mistake(["train", ENV, f"--device={rng.choice(['cpu', 'auto'])}"], f"device: {only}"),
+        Mistake(["train", ENV, "--device=gpu"], "device: no NVIDIA GPU here"),
         Mistake(["train", ENV, f"--devices={count}"], f"devices: {only}"),
         Mistake(["train", ENV, "--reset=cached"], f"reset: {only}"),
         Mistake(["train", ENV, "--distributed=here:1,2,0"], f"distributed: {only}"),

@@ -102,6 +102,42 @@ def test_a_network_of_another_kind_acts_by_one_call_per_step_which_gives_the_sco
     trainer.envs.close()
 
 
+ONCE, EACH_STEP = {"score": MEMBERS}, {"act": STEPS}
+WAYS: dict[str, tuple[dict[str, Any], dict[str, int]]] = {
+    "boards": ({"env": "small_envs:Board", "network": "small-cnn"}, EACH_STEP),
+    "memory": (
+        {"recurrent": "lstm", "recurrent_width": 4, "sequence_length": 8},
+        {**EACH_STEP, **ONCE},
+    ),
+    "Dict": ({"env": "small_envs:Spaced", "env_kwargs": {"observation": "dict"}}, ONCE),
+    "masks": (
+        {"env": "small_envs:Choosy", "env_kwargs": '{"several": true}', "action_mask": True},
+        ONCE,
+    ),
+    "rows": ({"env": "vector_envs:same"}, ONCE),
+    "workers": ({"env_processes": 2}, ONCE),
+    "a2c": ({"algorithm": "a2c"}, ONCE),
+    "replay": ({"replay_rollouts": 2}, ONCE),
+    "sampler": ({"arm": "top-advantage"}, ONCE),
+    "filter": ({"arm": "sauna", "dropped": "mask"}, {**ONCE, "decide": MEMBERS}),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_compiled_calls_per_rollout_of_each_way_to_train(way: str) -> None:
+    """One call per member and rollout; per env step only where the policy is no MLP. A time limit
+    costs one more, for the value of what the episode had reached."""
+    settings, more = WAYS[way]
+    trainer = Trainer(**{"env": "small_envs:Scripted", "arm": "ppo", **settings})
+    trainer.iterate(0)
+    trainer.calls.clear()
+    trainer.iterate(1)
+    limits = int(trainer.collector._buffers.truncated.sum())
+    once = dict.fromkeys(("draw", "make_batch", "learn"), MEMBERS)
+    assert trainer.calls == {**once, "value": MEMBERS + limits, **more}
+    trainer.envs.close()
+
+
 @pytest.mark.parametrize("arm", ["ppo", "sauna"])
 def test_nothing_is_compiled_after_the_first_iteration(arm: str) -> None:
     """A filtered arm drops nothing at first, and then so much that its segments are short."""

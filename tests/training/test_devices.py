@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 
 import sauna
-from helpers import SMALL, TESTS
+from helpers import SMALL, TESTS, train_here
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.training import prepare
+from sauna.training.coordinator import _environment
 from sauna.training.loop.device_program import make_mesh
 from sauna.training.loop.multihost import HostRank, read_host_rank
 
+HOST = "small_envs:Scripted"
 SETTINGS = [
     "jax_envs:walk",
     "--arm",
@@ -171,6 +173,27 @@ def test_a_gpu_that_is_hidden_is_not_used(
     monkeypatch.setattr(prepare.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(prepare.Path, "exists", lambda path: "nvidia" in str(path))
     assert prepare.has_gpu() == usable
+
+
+def test_without_a_gpu_none_is_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Environments on the host learn on the CPU, unless a GPU is asked for that is there."""
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    assert prepare.prepare({"env": HOST, "device": "cpu"}).config.device == "cpu"
+    for env in (HOST, "jax_envs:walk"):
+        with pytest.raises(BadInput, match="device: no NVIDIA GPU here"):
+            prepare.prepare({"env": env, "device": "gpu"})
+
+
+@pytest.mark.parametrize("device, platform", [("auto", "cpu"), ("cpu", "cpu"), ("gpu", "cuda")])
+def test_environments_on_the_host_learn_on_the_gpu_that_is_asked_for(
+    device: str, platform: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prepare, "has_gpu", lambda: True)
+    prepared = prepare.prepare({"env": HOST, "device": device})
+    assert _environment(prepared.config)["JAX_PLATFORMS"] == platform
+    if device == "gpu":  # this process has set up JAX for the CPU
+        with pytest.raises(BadInput, match="device: JAX uses the cpu here, not the gpu"):
+            train_here(prepared.job())
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,7 @@
-"""What only an accelerator can show: a population there learns what the CPU learns."""
+"""What only an accelerator can show: a population there learns what the CPU learns.
+
+Each run trains in processes of its own: JAX of this one is set up for the CPU.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from sauna.training.prepare import has_gpu
 
 pytestmark = [
     pytest.mark.gpu,
+    pytest.mark.processes,
     pytest.mark.skipif(not has_gpu(), reason="needs an NVIDIA GPU and JAX with CUDA"),
 ]
 SETTINGS: dict[str, Any] = {
@@ -30,8 +34,21 @@ SETTINGS: dict[str, Any] = {
 ENV = "gymnax/CartPole-v1"
 
 
+HOST: dict[str, Any] = {"env": "CartPole-v1", "processes": 1}
+PLACES: dict[str, dict[str, Any]] = {
+    "the device": {},
+    "the host": HOST,
+    "the host, a memory": {
+        **HOST,
+        "recurrent": "lstm",
+        "recurrent_width": 8,
+        "sequence_length": 8,
+    },
+}
+
+
 def trained(out: Path, device: str, **more: Any) -> Path:
-    sauna.train(ENV, out=str(out), device=device, **{**SETTINGS, **more})
+    sauna.train(out=str(out), device=device, **{"env": ENV, **SETTINGS, **more})
     return out
 
 
@@ -39,9 +56,21 @@ def rows(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("arm", ["ppo", "sauna", "top-advantage"])
-def test_the_first_update_is_that_of_the_cpu_up_to_rounding(arm: str, tmp_path: Path) -> None:
-    found = [rows(trained(tmp_path / device, device, arm=arm)) for device in ("gpu", "cpu")]
+@pytest.mark.parametrize(
+    "arm, place",
+    [
+        ("ppo", "the device"),
+        ("sauna", "the device"),
+        ("top-advantage", "the device"),
+        ("sauna", "the host"),
+        ("ppo", "the host, a memory"),
+    ],
+)
+def test_the_first_update_is_that_of_the_cpu_up_to_rounding(
+    arm: str, place: str, tmp_path: Path
+) -> None:
+    own = {**PLACES[place], "arm": arm}
+    found = [rows(trained(tmp_path / device, device, **own)) for device in ("gpu", "cpu")]
     for one, other in zip(*found, strict=True):
         if one["iteration"] == 0:  # later, rounding decides which actions are drawn
             for name in ("policy_loss", "value_loss", "entropy", "kept_steps"):

@@ -221,7 +221,7 @@ def test_a_run_keeps_the_values_that_it_began_with(run, monkeypatch) -> None:
     assert (run / "metrics.jsonl").read_bytes() == expected
 
 
-@pytest.mark.parametrize("change", [{"devices": 2}, {"device": "cpu"}, {"distributed": "h:1,2,0"}])
+@pytest.mark.parametrize("change", [{"devices": 2}, {"distributed": "h:1,2,0"}])
 def test_what_only_the_device_reads_is_refused_on_the_host(change: dict, run) -> None:
     make_incomplete(run, 2)
     with pytest.raises(BadInput, match="only read with backend device"):

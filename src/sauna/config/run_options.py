@@ -111,10 +111,9 @@ class RunOptions:
     )
     device: str = _where(
         "auto",
-        "with backend device: gpu if there is one (auto), or the CPU",
+        "where the policy learns (auto: with backend device the GPU if there is one, else the CPU)",
         choices=("auto", "cpu", "gpu"),
         common=True,
-        device_only=True,
         resumable=True,
     )
     devices: int = _where(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 
+from sauna.system.errors import BadInput
+
 # What a worker's JAX on the CPU has to know before it is imported.
 ON_CPU = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
 
@@ -37,3 +39,16 @@ def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
         jax.config.update("jax_compilation_cache_dir", os.path.join(base, "sauna", "jax"))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def check_platform(device: str) -> None:
+    """Refuses to go on where JAX was set up for another device in this process.
+
+    Raises:
+      BadInput: naming both.
+    """
+    import jax
+
+    found = jax.devices()[0].platform
+    if found != device:
+        raise BadInput(f"device: JAX uses the {found} here, not the {device}")

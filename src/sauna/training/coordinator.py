@@ -386,6 +386,6 @@ def _failure(run: Path, header: dict[str, Any]) -> SaunaError:
 
 def _environment(config: Config) -> dict[str, str]:
     """Lists what a worker's JAX has to know before it is imported."""
-    if config.backend == "device" and config.device == "gpu":
+    if config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
     return ON_CPU

@@ -97,6 +97,11 @@ def place(run: RunConfig) -> RunConfig:
     if config.backend == "auto" and is_native(config.env, json.loads(config.env_kwargs)):
         run = run.replace(backend="device")
         config = run.config
+    if config.device == "gpu" and not has_gpu():
+        raise BadInput(
+            "device: no NVIDIA GPU here that JAX can use; "
+            "`pip install 'sauna-rl[gpu]'` where there is one"
+        )
     if config.backend != "device":
         return run
     if config.env_processes:
@@ -106,15 +111,9 @@ def place(run: RunConfig) -> RunConfig:
     most = config.steps * (config.max_env_steps_factor if config.budget == "kept" else 1)
     if most > MAX_STEPS:
         raise BadInput(f"steps: the device counts to {MAX_STEPS}, not to {most}")
-    device = config.device
-    if device == "gpu" and not has_gpu():
-        raise BadInput(
-            "device: no NVIDIA GPU here that JAX can use; "
-            "`pip install 'sauna-rl[gpu]'` where there is one"
-        )
-    if device == "auto":
-        device = "gpu" if has_gpu() else "cpu"
-    return run.replace(device=device)
+    if config.device == "auto":
+        return run.replace(device="gpu" if has_gpu() else "cpu")
+    return run
 
 
 def has_gpu() -> bool:

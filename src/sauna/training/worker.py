@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
@@ -109,7 +109,8 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
         if dies_alone:
             _import_ahead()
         header, arrays = receive(inbox)
-        configure_jax(header["config"]["devices"], _device(header["config"]))
+        config = header["config"]
+        configure_jax(config["devices"], "gpu" if config["device"] == "gpu" else "cpu")
         reporter = PipeReporter(inbox, outbox, dies_alone)
         train_members(read_job(header, arrays), reporter)
         send(outbox, {"kind": "done"})
@@ -146,10 +147,6 @@ def train_members(job: Job, reporter: Reporter) -> None:
         from sauna.training.loop.host import train_on_host
 
         train_on_host(job, reporter)
-
-
-def _device(config: Mapping[str, Any]) -> str:
-    return "gpu" if config["backend"] == "device" and config["device"] == "gpu" else "cpu"
 
 
 def write_job(

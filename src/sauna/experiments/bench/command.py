@@ -15,7 +15,7 @@ from typing import Any
 
 from sauna.config.presets import plain, resolve
 from sauna.experiments.bench.peer_settings import LACKS, peer_settings
-from sauna.experiments.bench.peers import peer_rate, prepare, versions
+from sauna.experiments.bench.peers import peer_rate, prepare, script_digest, versions
 from sauna.experiments.bench.rates import (
     WARM_UP,
     alternate,
@@ -87,6 +87,7 @@ def bench(
             "versions": versions(python),
             "settings": settings,
             "measured_without": lacks,
+            **script_digest(script),
         }
         if lacks:
             say(f"{against} is measured without {', '.join(lacks)}, which it does not have")
@@ -125,8 +126,10 @@ def bench_scale(
 
 def _split_elsewhere(overrides: Mapping[str, Any], share: int) -> dict[str, float]:
     """`split` in a process that is set up as a training worker is."""
+    device = "gpu" if resolve(overrides).device == "gpu" else "cpu"
     code = (
-        "import json, sys; from sauna.training.worker import configure_jax; configure_jax(); "
+        "import json, sys; from sauna.system.jax_setup import configure_jax; "
+        f"configure_jax(device={device!r}); "
         "from sauna.experiments.bench.split import split; "
         "print(json.dumps(split(json.loads(sys.argv[1]), int(sys.argv[2]))))"
     )

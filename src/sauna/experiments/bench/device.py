@@ -21,7 +21,7 @@ from sauna.config.presets import plain, resolve, resolve_run
 from sauna.config.settings import Config
 from sauna.experiments.bench.command import SECONDS
 from sauna.experiments.bench.peer_settings import GYMNAX_PEERS, peer_settings
-from sauna.experiments.bench.peers import peer_rate, prepare, versions
+from sauna.experiments.bench.peers import peer_rate, prepare, script_digest, versions
 from sauna.experiments.bench.rates import ratio
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, SaunaError
@@ -119,7 +119,8 @@ def _gymnax_peer(
     def measure() -> dict[str, float]:
         return {peer: peer_rate(peer, python, script, settings, 1, SECONDS)}
 
-    return measure, {"name": peer, "versions": versions(python), "settings": settings}
+    about = {"name": peer, "versions": versions(python), "settings": settings}
+    return measure, {**about, **script_digest(script)}
 
 
 def _check_one_member(peer: str, config: Config) -> None:

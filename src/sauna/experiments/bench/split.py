@@ -24,7 +24,9 @@ from sauna.algorithm.rollout.program import Program, make_program
 from sauna.algorithm.types import TrainState, member_keys, selection_key
 from sauna.envs.host import mujoco_tasks
 from sauna.envs.host.atari_envs import AtariEnvs
+from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.mujoco_tasks import BatchTask
+from sauna.envs.make import is_mujoco
 from sauna.system.checkpoint import save_checkpoint
 from sauna.training.loop import budget, host
 from sauna.training.loop.member_state import Counters
@@ -101,7 +103,7 @@ def split(settings: dict[str, Any], count: int) -> dict[str, float]:
     envs = host.make_envs(job)
     keys = [member_keys(member.seed) for member in job.members]
     collector = HostCollector(program, job.spaces, envs, keys)
-    restore = _wrap_host(collector, envs, timers)
+    restore = _wrap_host(collector, envs, config.env, timers)
     try:
         steps, seconds, states, counters = _train(job, learner, collector, timers)
         saving = _checkpoint_seconds(job, program, collector, states, counters)
@@ -130,7 +132,7 @@ def _timed(functions: Compiled, sections: Mapping[str, str], timers: Timers) -> 
     return functions._replace(**wrapped)
 
 
-def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
+def _wrap_host(collector: Any, envs: Any, env: str, timers: Timers) -> Callable[[], None]:
     """Puts timers around acting, normalising and stepping; returns what takes the physics' off."""
     actor, moments = collector._actor, collector.observation_moments
     actor.act = timers.wrap("inference", actor.act)
@@ -139,15 +141,18 @@ def _wrap_host(collector: Any, envs: Any, timers: Timers) -> Callable[[], None]:
     envs.step = timers.wrap("environment", envs.step)
     if hasattr(envs, "_is_finite"):
         envs._is_finite = timers.wrap("checks", envs._is_finite)
-    where, name = _physics(envs)
+    where, name = _physics(envs, env)
     plain = getattr(where, name)
     setattr(where, name, timers.wrap("physics", plain))
     return lambda: setattr(where, name, plain)
 
 
-def _physics(envs: Any) -> tuple[Any, str]:
-    """Where the simulator is stepped here: a module or an object, and a function's name."""
-    if isinstance(envs, AtariEnvs):
+def _physics(envs: Any, env: str) -> tuple[Any, str]:
+    """Where the simulator is stepped here: a module or an object, and a function's name.
+
+    Of an environment whose simulator is not known, that is its own `step`.
+    """
+    if isinstance(envs, AtariEnvs) or (type(envs) is GymnasiumEnvs and not is_mujoco(env)):
         return envs, "_take"
     if isinstance(getattr(envs, "_task", None), BatchTask):
         return mujoco_tasks, "_advance"

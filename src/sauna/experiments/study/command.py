@@ -216,7 +216,7 @@ def _check_runs(spec: Spec) -> None:
 def _on_gpu(spec: Spec) -> bool:
     """Whether some run takes a whole GPU, which others would only slow down."""
     configs = (place(resolved(arm, task)).config for arm in spec.arms for task in arm.tasks)
-    return any(config.backend == "device" and config.device == "gpu" for config in configs)
+    return any(config.device == "gpu" for config in configs)
 
 
 def _train(

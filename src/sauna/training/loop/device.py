@@ -30,6 +30,7 @@ from sauna.envs.device.stacked import stacked
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
+from sauna.system.jax_setup import check_platform
 from sauna.system.run_directory import versions
 from sauna.training.loop.budget import budget_left
 from sauna.training.loop.device_program import (
@@ -154,9 +155,8 @@ def _devices(config: Config) -> list[Any]:
     Raises:
       BadInput: there are fewer than asked for, or of another kind.
     """
+    check_platform(config.device)
     found, wanted = jax.devices(), config.devices
-    if found[0].platform != config.device:
-        raise BadInput(f"device: JAX uses the {found[0].platform} here, not the {config.device}")
     if wanted > len(found):
         raise BadInput(f"devices: {wanted} asked for, this machine has {len(found)}")
     return found[:wanted] if wanted else found

@@ -27,6 +27,7 @@ from sauna.envs.make import in_process_envs
 from sauna.envs.workers import ProcessEnvs
 from sauna.envs.wrapping import wrapping_of
 from sauna.system.checkpoint import under
+from sauna.system.jax_setup import check_platform
 from sauna.training.loop.budget import budget_left, hypers_now, step_limit
 from sauna.training.loop.evaluation import Evaluator, stop_named
 from sauna.training.loop.fine_tuning import initial_moments, initial_params
@@ -47,9 +48,12 @@ def train_on_host(job: Job, reporter: Reporter) -> None:
     Raises:
       NonFinite: an update gave a non-finite loss or parameter; nothing of it was reported.
       EnvironmentFailure: from the environments.
+      BadInput: JAX does not use the GPU that is asked for.
     """
     config, members = job.config, job.members
     reporter.phase("making environments")
+    if config.device == "gpu":
+        check_platform("gpu")
     program = make_program(config, job.spaces)
     learner = make_learner(config, program.policy, job.spaces)
     keys = [member_keys(member.seed) for member in members]
