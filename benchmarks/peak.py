@@ -41,7 +41,7 @@ from make import BOUNDED, RESULTS  # noqa: E402
 from selection import CHEETAH, PONG, config_of, least_of_a_block, one_update  # noqa: E402
 
 from sauna.algorithm.learner.optimizers import optimizer, scaling  # noqa: E402
-from sauna.algorithm.policy.convolutions import LAYERS, PICTURES  # noqa: E402
+from sauna.algorithm.policy.convolutions import LAYERS  # noqa: E402
 from sauna.algorithm.policy.policy import make_policy  # noqa: E402
 from sauna.algorithm.types import Hypers  # noqa: E402
 from sauna.config.settings import Config  # noqa: E402
@@ -51,6 +51,7 @@ from sauna.training.prepare import prepare  # noqa: E402
 
 PATH = RESULTS / "peak.json"
 SIDE = 1024
+PICTURES = 8  # whose products of the convolutions are made together
 POLE = Spaces("vector", (4,), "discrete", (2,), "", "")
 BREAKOUT = Spaces("vector", (400,), "discrete", (3,), "", "")
 # Whose update, its settings, and the spaces.
@@ -143,7 +144,7 @@ def convolutions_of(pictures: Spaces) -> int:
 
 def products_of_the_cnn(config: Config, pictures: Spaces) -> Callable[[], float]:
     """A function that makes the products of one update of the Nature CNN and returns their CPU
-    seconds: a few pictures at a time up to the last convolution, as the update does."""
+    seconds: up to the last convolution `PICTURES` at a time; the update takes a few, too."""
     batch = config.envs * config.rollout_steps
     size, rng = batch // config.minibatches, np.random.default_rng(0)
     sizes = sizes_of_the_cnn(pictures)

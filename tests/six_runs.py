@@ -7,7 +7,8 @@ The runs cover PPO, every SAUNA arm, A2C, the device backend and Atari. A digest
 checkpoint's arrays (parameters, optimizer, normalizer, environments, counters) by name and bytes.
 Bits depend on the processor and on the versions of JAX and MuJoCo, so the file names both. Of a
 processor that it does not know, write those of an earlier revision first. Atari's were written anew
-once: since then a CNN acts by XLA's convolution.
+twice: when a CNN began to act by XLA's convolution, and when compiled functions of our own replaced
+that on a CPU.
 """
 
 from __future__ import annotations

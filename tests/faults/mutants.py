@@ -311,21 +311,40 @@ MUTANTS = [
     ),
     *_of(
         "algorithm/policy/convolutions.py",
-        "networks",
-        ("pixels not scaled", "beside.astype(jnp.float32) / 255.0", "beside.astype(jnp.float32)"),
+        "convolutions networks",
+        ("pixels not scaled", "x = x / high", "x = x / 1.0"),
+        ("floats without a gradient", "rectified, not of_bytes)", "rectified, of_bytes)"),
+        ("the ReLU forgotten", "[stride, rectified], np.int32))", "[stride, 0], np.int32))"),
+    ),
+    *_of(
+        "algorithm/policy/compiled_convolution.py",
+        "convolutions networks",
         (
-            "pixels not scaled without a gradient",
-            "x = x.astype(jnp.float32) / 255.0",
-            "x = x.astype(jnp.float32)",
+            "kernel upside down",
+            "line = lines[b * x.shape[1] + i * stride + k]\n"
+            "                begin = (((b - first) * rows + i) * columns * width + k) * run\n"
+            "                for j in range(columns):\n"
+            "                    to",
+            "line = lines[b * x.shape[1] + i * stride + width - 1 - k]\n"
+            "                begin = (((b - first) * rows + i) * columns * width + k) * run\n"
+            "                for j in range(columns):\n"
+            "                    to",
         ),
-        ("kernel upside down", "@ rows[i] for i", "@ rows[-1 - i] for i"),
+        ("overlapping patches not added", "to[c] += of[c]", "to[c] = of[c]"),
+        ("dead units learn", "output[begin + i, j] > 0.0 or not rectified", "True"),
+        ("gradient of the last turn only", "total[i, j] += part[i, j]", "total[i, j] = part[i, j]"),
         (
-            "columns and rows of a block swapped",
-            "transpose(0, 2, 1, 3, 4, 5)",
-            "transpose(0, 2, 3, 1, 4, 5)",
+            "each turn writes to the first one's place",
+            "output[first * pixels : last * pixels]",
+            "output[: (last - first) * pixels]",
         ),
-        ("dead units learn", "jnp.where(outputs[i] > 0, d, 0.0)", "d"),
-        ("gradient of the last piece only", "jax.tree.map(jnp.add, total, gradients)", "gradients"),
+        ("a turn of no pictures", "max(min(PATCHES // numbers, count), 1)", "min(1, count)"),
+        (
+            "what is not a number becomes 0",
+            "rectified and value < 0.0",
+            "rectified and not value > 0.0",
+        ),
+        ("another interface is accepted", "here if np.int32(here) == MAJOR else OLDEST", "here"),
     ),
     *_of(
         "algorithm/policy/networks.py",

@@ -22,3 +22,15 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return numba.njit(cache=True, error_model="numpy")(function)
     except RuntimeError:  # no folder that could be written to: compiled anew in each process
         return numba.njit(error_model="numpy")(function)
+
+
+def compiled_for_c(signature: Any, function: Callable[..., Any]) -> Any:
+    """`function` compiled now, or read from the cache, as C may call it: its `ctypes` points to it.
+
+    Args:
+      signature: Numba's types of the result and the arguments.
+    """
+    try:
+        return numba.cfunc(signature, cache=True)(function)
+    except RuntimeError:  # as above
+        return numba.cfunc(signature)(function)

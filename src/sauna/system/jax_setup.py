@@ -24,6 +24,7 @@ def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
     platform = os.environ.get("JAX_PLATFORMS") or {"cpu": "cpu", "gpu": "cuda"}[device]
     if platform == "cpu":
         os.environ.setdefault("PJRT_NPROC", "1")
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of SciPy's, which Numba calls
     else:  # others may share it: memory is taken as it is needed, not three quarters at once
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     ours = "jax" not in sys.modules  # else the process has chosen

@@ -1,127 +1,87 @@
-"""The Nature CNN's convolutions (Mnih et al. 2015), a few pictures at a time on a CPU.
+"""Convolutions of pictures without a border, and the Nature CNN's three (Mnih et al. 2015).
 
-All that lies between the layers of a minibatch is many times larger than a CPU's cache, and waiting
-for memory takes most of the time. So forward and backward go through the minibatch in pieces that
-the cache holds; the gradients of the weights are added up on the way.
+XLA has no fast convolution for a CPU if a gradient is taken inside a loop, as in every update. So
+on a CPU a compiled function of our own takes its place.
 """
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from sauna.algorithm.policy import compiled_convolution
 from sauna.algorithm.types import Array
 
 LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # features, width of the kernel, stride
-PICTURES = 8  # of a piece
 
 Layer = tuple[Array, Array]  # kernel [K, K, C, F], bias [F]
 
 
-@jax.custom_vjp
-def convolutions(layers: list[Layer], x: Array) -> Array:
-    """`[B, H, W, C]` -> `[B, H', W', 64]`: each of `LAYERS`, and a ReLU.
+def convolutions(layers: list[Layer], x: Array, high: float = 255.0) -> Array:
+    """`[B, H, W, C]` -> `[B, H', W', 64]`: each of `LAYERS`, and a ReLU."""
+    for layer, (_, _, stride) in zip(layers, LAYERS, strict=True):
+        x = convolution(*layer, x, stride, rectified=True, high=high)
+    return x
 
-    uint8 pictures are scaled to [0, 1]. Without a gradient, XLA's own convolution is faster.
+
+def convolution(
+    kernel: Array, bias: Array, x: Array, stride: int, rectified: bool = False, high: float = 255.0
+) -> Array:
+    """A convolution without a border, `[B, H, W, C]` -> `[B, H', W', F]`.
+
+    Args:
+      kernel: `[K, K, C, F]`; bias: `[F]`.
+      x: numbers, or bytes, which are divided by `high` and have no gradient.
+      stride: by how many pixels the kernel moves.
+      rectified: whether a ReLU follows.
     """
-
-    def piece(x: Array) -> Array:
-        if x.dtype == jnp.uint8:
-            x = x.astype(jnp.float32) / 255.0
-        for (kernel, bias), (_, _, stride) in zip(layers, LAYERS, strict=True):
-            x = jnp.maximum(plain_convolution(kernel, x, stride) + bias, 0.0)
-        return x
-
-    return joined(jax.lax.map(piece, in_pieces(x)), len(x))
-
-
-def plain_convolution(kernel: Array, x: Array, stride: int) -> Array:
-    """A VALID convolution `[B, H, W, C]` -> `[B, H', W', F]` by XLA."""
+    of_bytes = x.dtype == jnp.uint8
+    x = x.astype(jnp.float32)
+    if of_bytes:
+        x = x / high
+    if jax.default_backend() == "cpu":
+        return _by_patches(kernel, bias, x, stride, rectified, not of_bytes)
     axes = ("NHWC", "HWIO", "NHWC")
-    return jax.lax.conv_general_dilated(x, kernel, (stride,) * 2, "VALID", dimension_numbers=axes)
+    out = jax.lax.conv_general_dilated(x, kernel, (stride,) * 2, "VALID", dimension_numbers=axes)
+    return jnp.maximum(out + bias, 0.0) if rectified else out + bias
 
 
-def _forward(layers: list[Layer], x: Array) -> tuple[Array, tuple[list[Layer], Array, list[Array]]]:
-    def piece(x: Array) -> list[Array]:
-        outputs = []
-        for (kernel, bias), (_, _, stride) in zip(layers, LAYERS, strict=True):
-            x = jnp.maximum(convolution(kernel, bias, x, stride), 0.0)
-            outputs.append(x)
-        return outputs
+@partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
+def _by_patches(
+    kernel: Array, bias: Array, x: Array, stride: int, rectified: bool, of_x: bool
+) -> Array:
+    """`convolution` by `compiled_convolution`, whose buffers are float32.
 
-    outputs = jax.lax.map(piece, in_pieces(x))
-    return joined(outputs[-1], len(x)), (layers, x, outputs)
+    Args:
+      of_x: whether x has a gradient.
+    """
+    compiled_convolution.register()
+    side = [(n - kernel.shape[0]) // stride + 1 for n in x.shape[1:3]]
+    out = jax.ShapeDtypeStruct((len(x), *side, kernel.shape[-1]), jnp.float32)
+    call = jax.ffi.ffi_call(compiled_convolution.FORWARD, out, vmap_method="sequential")
+    return call(kernel, bias, x, np.array([stride, rectified], np.int32))
+
+
+def _forward(
+    kernel: Array, bias: Array, x: Array, stride: int, rectified: bool, of_x: bool
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    out = _by_patches(kernel, bias, x, stride, rectified, of_x)
+    return out, (kernel, x, out)
 
 
 def _backward(
-    saved: tuple[list[Layer], Array, list[Array]], cotangent: Array
-) -> tuple[list[Layer], Array | None]:
-    layers, x, outputs = saved
-    has_gradient = jnp.issubdtype(x.dtype, jnp.floating)  # bytes have none
-
-    def piece(total: list[Layer], of: tuple[Array, list[Array], Array]) -> tuple[list[Layer], Any]:
-        x, outputs, d = of
-        gradients: list[Layer] = []
-        for i in reversed(range(len(LAYERS))):
-            d = jnp.where(outputs[i] > 0, d, 0.0)
-            layer = partial(convolution, stride=LAYERS[i][2])
-            _, pull = jax.vjp(layer, *layers[i], outputs[i - 1] if i else x)
-            of_kernel, of_bias, d = pull(d)
-            gradients.insert(0, (of_kernel, of_bias))
-        return jax.tree.map(jnp.add, total, gradients), d if has_gradient else ()
-
-    zeros = jax.tree.map(jnp.zeros_like, layers)
-    pieces = (in_pieces(x), outputs, in_pieces(cotangent))
-    total, of_x = jax.lax.scan(piece, zeros, pieces)
-    return total, joined(of_x, len(x)) if has_gradient else None
+    stride: int, rectified: bool, of_x: bool, saved: tuple[Array, Array, Array], cotangent: Array
+) -> tuple[Array, Array, Array | None]:
+    kernel, x, out = saved
+    shapes = kernel.shape, kernel.shape[-1:], x.shape if of_x else (0,) * 4
+    gradients = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    call = jax.ffi.ffi_call(compiled_convolution.BACKWARD, gradients, vmap_method="sequential")
+    how = np.array([stride, rectified], np.int32)
+    by_kernel, by_bias, by_x = call(kernel, x, out, cotangent, how)
+    return by_kernel, by_bias, by_x if of_x else None
 
 
-convolutions.defvjp(_forward, _backward)
-
-
-def in_pieces(x: Array) -> Array:
-    """`[B, ...]` -> `[B / PICTURES, PICTURES, ...]`, filled up with zeros; elsewhere one piece."""
-    size = min(PICTURES, len(x)) if jax.default_backend() == "cpu" else len(x)
-    filled = jnp.pad(x, [(0, -len(x) % size)] + [(0, 0)] * (x.ndim - 1))
-    return filled.reshape(-1, size, *x.shape[1:])
-
-
-def joined(pieces: Array, length: int) -> Array:
-    """What `in_pieces` made of `[length, ...]`."""
-    return pieces.reshape(-1, *pieces.shape[2:])[:length]
-
-
-def convolution(kernel: Array, bias: Array, x: Array, stride: int) -> Array:
-    """A VALID convolution `[B, H, W, C]` -> `[B, H', W', F]` as a few products of matrices.
-
-    The picture is cut into blocks of `stride` x `stride` pixels, after which the kernel moves by
-    one; then one product per row of the kernel. XLA's own convolution is many times slower than
-    this on a CPU if a gradient is taken inside a loop, as in every update.
-
-    Args:
-      kernel: `[K, K, C, F]`, K a multiple of `stride`.
-    """
-    width, features = kernel.shape[0], kernel.shape[-1]
-    across = width // stride  # blocks that the kernel covers
-    blocks = into_blocks(x, width, stride)
-    columns = blocks.shape[2] - across + 1
-    beside = jnp.concatenate([blocks[:, :, j : j + columns] for j in range(across)], -1)
-    if beside.dtype == jnp.uint8:
-        beside = beside.astype(jnp.float32) / 255.0
-    per_block = (across, stride, across, stride, -1, features)
-    rows = kernel.reshape(per_block).transpose(0, 2, 1, 3, 4, 5).reshape(across, -1, features)
-    height = blocks.shape[1] - across + 1
-    return sum((beside[:, i : i + height] @ rows[i] for i in range(across)), start=bias)
-
-
-def into_blocks(x: Array, kernel: int, stride: int) -> Array:
-    """`[B, H, W, C]` -> `[B, H / stride, W / stride, stride * stride * C]`.
-
-    Pixels that no step of the kernel reaches are cut off.
-    """
-    height, width = ((n - kernel) // stride * stride + kernel for n in x.shape[1:3])
-    x = x[:, :height, :width].reshape(len(x), height // stride, stride, width // stride, -1)
-    return x.transpose(0, 1, 3, 2, 4).reshape(len(x), height // stride, width // stride, -1)
+_by_patches.defvjp(_forward, _backward)

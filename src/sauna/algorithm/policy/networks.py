@@ -80,13 +80,11 @@ class NatureCNN(nn.Module):
     def __call__(self, observation: Array) -> Array:
         lead = observation.shape[:-3]
         x = observation.reshape((-1, *observation.shape[-3:]))
-        if x.dtype == jnp.uint8 and self.high != 255.0:  # which `convolutions` divides by
-            x = x.astype(jnp.float32) / self.high
         layers, channels = [], x.shape[-1]
         for i, (features, width, _) in enumerate(LAYERS):
             layers.append(Convolution(features, width, name=f"conv_{i}")(channels))
             channels = features
-        x = convolutions(layers, x)
+        x = convolutions(layers, x, self.high)
         x = nn.relu(dense(512, math.sqrt(2.0), "dense")(x.reshape((x.shape[0], -1))))
         return x.reshape((*lead, -1))
 

@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.policy.convolutions import Layer, convolution, in_pieces, joined
+from sauna.algorithm.policy.convolutions import Layer, convolution
 from sauna.algorithm.policy.networks import Convolution, dense
 from sauna.algorithm.types import Array
 from sauna.envs.pictures import channels_first
@@ -32,16 +32,17 @@ class SmallCNN(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        x, lead = pictures(observation, self.board, self.high)
+        x, lead = pictures(observation, self.board)
         for i, features in enumerate((16, 32)):
             layer = Convolution(features, 3, name=f"conv_{i}")(x.shape[-1])
-            x = nn.relu(padded(layer, x))[:, :: i + 1, :: i + 1]
+            x = padded(layer, x, stride=i + 1, rectified=True, high=self.high)
         x = nn.relu(dense(128, math.sqrt(2.0), "dense")(x.reshape((len(x), -1))))
         return x.reshape((*lead, -1))
 
 
 SECTIONS = (16, 32, 32)  # features of each section of IMPALA's network
 BLOCKS = 2  # residual blocks of a section
+PICTURES = 8  # that a CPU takes at a time
 
 
 class ImpalaCNN(nn.Module):
@@ -59,13 +60,13 @@ class ImpalaCNN(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        x, lead = pictures(observation, self.board, self.high)
+        x, lead = pictures(observation, self.board)
         layers, channels = [], x.shape[-1]
         for i, features in enumerate(SECTIONS):
             for j in range(1 + 2 * BLOCKS):
                 layers.append(Convolution(features, 3, name=f"conv_{i}_{j}")(channels))
                 channels = features
-        x = by_pieces(lambda x: residual(layers, x), x)
+        x = by_pieces(lambda x: residual(layers, x, self.high), x)
         x = nn.relu(dense(256, math.sqrt(2.0), "dense")(x.reshape((len(x), -1))))
         return x.reshape((*lead, -1))
 
@@ -76,10 +77,8 @@ PICTURE_NETWORKS: dict[str, type[SmallCNN | ImpalaCNN]] = {
 }
 
 
-def pictures(
-    observation: Array, board: tuple[int, ...], high: float
-) -> tuple[Array, tuple[int, ...]]:
-    """Observations as `[B, H, W, C]` float32, bytes divided by `high`; and their leading axes."""
+def pictures(observation: Array, board: tuple[int, ...]) -> tuple[Array, tuple[int, ...]]:
+    """Observations as `[B, H, W, C]`, and their leading axes."""
     axes = 1 if board else 3
     lead, x = observation.shape[:-axes], observation
     x = x.reshape((-1, *(board or x.shape[-3:])))
@@ -87,21 +86,24 @@ def pictures(
         x = x[..., None]
     elif channels_first(board):
         x = jnp.moveaxis(x, 1, -1)
-    return (x.astype(jnp.float32) / high if x.dtype == jnp.uint8 else x), lead
+    return x, lead
 
 
-def padded(layer: Layer, x: Array) -> Array:
-    """A 3 x 3 convolution `[B, H, W, C]` -> `[B, H, W, F]`, with zeros around the picture."""
-    return convolution(*layer, jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0))), 1)
+def padded(
+    layer: Layer, x: Array, stride: int = 1, rectified: bool = False, high: float = 255.0
+) -> Array:
+    """A 3 x 3 `convolution` with zeros around the picture: `[B, H, W, F]` at a stride of 1."""
+    around = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    return convolution(*layer, around, stride, rectified, high)
 
 
-def residual(layers: list[Layer], x: Array) -> Array:
+def residual(layers: list[Layer], x: Array, high: float) -> Array:
     """The sections of `ImpalaCNN`, `[B, H, W, C]` -> `[B, H', W', 32]`, and a ReLU."""
     left = iter(layers)
     for _ in SECTIONS:
-        x = nn.max_pool(padded(next(left), x), (3, 3), (2, 2), "SAME")
+        x = nn.max_pool(padded(next(left), x, high=high), (3, 3), (2, 2), "SAME")
         for _ in range(BLOCKS):
-            inner = nn.relu(padded(next(left), nn.relu(x)))
+            inner = padded(next(left), nn.relu(x), rectified=True)
             x = x + padded(next(left), inner)
     return nn.relu(x)
 
@@ -112,7 +114,9 @@ def by_pieces(forward: Callable[[Array], Array], x: Array) -> Array:
     The gradient computes a piece anew: all that lies between the layers of a whole minibatch would
     need gigabytes.
     """
-    pieces = in_pieces(x)
-    if len(pieces) == 1:
+    if len(x) <= PICTURES or jax.default_backend() != "cpu":
         return forward(x)
-    return joined(jax.lax.map(jax.checkpoint(forward), pieces), len(x))
+    filled = jnp.pad(x, [(0, -len(x) % PICTURES)] + [(0, 0)] * (x.ndim - 1))
+    pieces = filled.reshape(-1, PICTURES, *x.shape[1:])
+    out = jax.lax.map(jax.checkpoint(forward), pieces)
+    return out.reshape(-1, *out.shape[2:])[: len(x)]
