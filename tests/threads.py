@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,7 @@ def trained_here() -> Iterator[None]:
     target = partial(worker.serve, dies_alone=False)
     with (
         patch("sauna.training.coordinator.start_worker", lambda *given: start_thread(target)),
+        patch("sauna.cli.spawned_ahead", lambda *given: nullcontext()),
         patch("sauna.experiments.study.execute.local.UnitProcess", UnitThread),
     ):
         yield

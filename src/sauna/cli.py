@@ -20,12 +20,7 @@ from sauna.config.choices import LISTS, PEERS
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint, spread_hint
 from sauna.config.parsing import whole_number
-from sauna.config.presets import (
-    COMPARED,
-    COMPARED_SEEDS,
-    overrides_of,
-    parse_all,
-)
+from sauna.config.presets import COMPARED, COMPARED_SEEDS, overrides_of, parse_all
 from sauna.config.settings import FIELDS, fields_with, flag
 from sauna.config.stored import read_stored
 from sauna.experiments.check import flags as checking
@@ -33,6 +28,8 @@ from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.share import flags as sharing
 from sauna.experiments.tune.flags import add_tune, tune_from_flags
 from sauna.system.errors import BadInput, Interrupted, SaunaError, printable
+from sauna.system.jax_setup import ON_CPU
+from sauna.system.spawn import spawned_ahead
 from sauna.system.supported import check_system
 from sauna.system.tracebacks import user_frames
 
@@ -245,6 +242,9 @@ def _run(arguments: list[str]) -> None:
     values = {name: value for name, value in vars(parsed).items() if name != "command"}
     if parsed.command is None:
         parser.print_help()
+    elif parsed.command in ("train", "resume"):
+        with spawned_ahead("sauna.training.worker", ON_CPU):  # imports JAX meanwhile
+            _COMMANDS[parsed.command](values)
     else:
         _COMMANDS[parsed.command](values)
 

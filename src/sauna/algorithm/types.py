@@ -130,7 +130,11 @@ def selection_key(keys: Keys, iteration: Any) -> Array:
 
 def member_keys(seed: int) -> Keys:
     """Keys that depend on the member's seed alone."""
-    root = jax.random.key(seed)
+    return _keys_of(jax.random.key(seed))
+
+
+@jax.jit  # one program for all of them, rather than one for each
+def _keys_of(root: Array) -> Keys:
     init, action, filter = jax.random.split(root, 3)
     return Keys(init, action, filter, jax.random.fold_in(root, 3), jax.random.fold_in(root, 4))
 

@@ -7,6 +7,10 @@ import sys
 
 from sauna.system.errors import BadInput
 
+# What a worker's JAX on the CPU has to know before it is imported.
+ONE_THREAD = dict.fromkeys(("PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+ON_CPU = {**ONE_THREAD, "JAX_PLATFORMS": "cpu"}
+
 
 def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
     """One CPU thread per process, synchronous dispatch, and a compilation cache on disk.
@@ -36,7 +40,7 @@ def configure_jax(simulated: int = 0, device: str = "cpu") -> None:
         base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         jax.config.update("jax_compilation_cache_dir", os.path.join(base, "sauna", "jax"))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def check_platform(device: str) -> None:

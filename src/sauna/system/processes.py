@@ -12,7 +12,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
@@ -20,6 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from safetensors.numpy import load, save
+
+from sauna.system.spawn import spawn
 
 
 class Message(NamedTuple):
@@ -140,24 +141,9 @@ class Worker(NamedTuple):
 
 
 def start_worker(module: str, environment: dict[str, str]) -> Worker:
-    """Starts `python -m module READ_FD WRITE_FD` in its own process group (Ctrl-C is ours)."""
-    to_child_read, to_child_write = os.pipe()
-    to_parent_read, to_parent_write = os.pipe()
-    path = os.pathsep.join(part or os.getcwd() for part in sys.path)
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, str(to_child_read), str(to_parent_write)],
-        pass_fds=(to_child_read, to_parent_write),
-        env={**os.environ, "PYTHONPATH": path, **environment},
-        stdin=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    os.close(to_child_read)
-    os.close(to_parent_write)
-    return Worker(
-        process,
-        Connection(to_parent_read, writable=False),
-        Connection(to_child_write, readable=False),
-    )
+    """Starts a process that runs the module; see `spawn`."""
+    process, inbox, outbox = spawn(module, environment)
+    return Worker(process, Connection(inbox, writable=False), Connection(outbox, readable=False))
 
 
 def start_thread(serve: Callable[[Connection, Connection], None]) -> Worker:

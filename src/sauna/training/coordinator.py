@@ -23,6 +23,7 @@ from sauna.config.checks import local_parts
 from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError, one_line, warn
+from sauna.system.jax_setup import ON_CPU
 from sauna.system.logs import Logs, check_logs
 from sauna.system.metrics_csv import MetricsCsv, trained_seconds
 from sauna.system.processes import Message, Worker, receive, start_thread, start_worker
@@ -387,5 +388,4 @@ def _environment(config: Config) -> dict[str, str]:
     """Lists what a worker's JAX has to know before it is imported."""
     if config.device == "gpu":
         return {"JAX_PLATFORMS": "cuda"}
-    one = dict.fromkeys(("PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    return {**one, "JAX_PLATFORMS": "cpu"}
+    return ON_CPU

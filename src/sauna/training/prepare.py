@@ -20,6 +20,7 @@ from sauna.envs.probe import Probe, probe, probe_on_device
 from sauna.envs.spaces import Spaces, board_of, seen_spaces
 from sauna.envs.wrapping import wrapping_of
 from sauna.system.errors import BadInput
+from sauna.system.imports import uncollected
 from sauna.system.jax_setup import configure_jax
 from sauna.training.loop.multihost import check_split, read_host_rank
 
@@ -160,11 +161,12 @@ def look_at(config: Config) -> Probe:
     kwargs = json.loads(config.env_kwargs)
     if config.backend != "device":
         return probe(config.env, kwargs, wrapping_of(config))
-    if local_parts(config):  # trained in this process
-        configure_jax(config.devices if config.device == "cpu" else 0, config.device)
-    else:
-        configure_jax()
-    return probe_on_device(config.env, kwargs, wrapping_of(config))
+    with uncollected():
+        if local_parts(config):  # trained in this process
+            configure_jax(config.devices if config.device == "cpu" else 0, config.device)
+        else:
+            configure_jax()
+        return probe_on_device(config.env, kwargs, wrapping_of(config))
 
 
 def check_writes(config: Config) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import importlib
 import os
 import sys
 import threading
@@ -26,6 +28,12 @@ if TYPE_CHECKING:
     from sauna.training.loop.job import Job, Reporter
 
 HEARTBEAT = 2.0  # seconds between two
+AHEAD = (  # what every training imports
+    "sauna.algorithm.learner.program",
+    "sauna.training.loop.evaluation",
+    "sauna.training.loop.metrics",
+    "scipy.linalg",  # by JAX, for the first orthogonal matrix
+)
 
 
 class PipeReporter:
@@ -63,6 +71,8 @@ class PipeReporter:
         send(self._outbox, {"kind": "phase", "text": text})
 
     def allowance(self, iteration: int) -> int:
+        if self._dies_alone:
+            gc.enable()  # the first iteration begins
         with self._changed:
             self._changed.wait_for(lambda: self._stop or iteration < self._granted)
             return max(self._granted - iteration, 0)
@@ -95,8 +105,10 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     if dies_alone:
         threading.Thread(target=_send_heartbeats, args=(outbox,), daemon=True).start()
     try:
-        header, arrays = receive(inbox)
         send(outbox, {"kind": "phase", "text": "importing JAX"})
+        if dies_alone:
+            _import_ahead()
+        header, arrays = receive(inbox)
         config = header["config"]
         configure_jax(config["devices"], "gpu" if config["device"] == "gpu" else "cpu")
         reporter = PipeReporter(inbox, outbox, dies_alone)
@@ -111,6 +123,13 @@ def serve(inbox: Connection, outlet: Connection, dies_alone: bool) -> None:
     except Exception as error:
         header = {"kind": "failure", "message": f"training raised {one_line(error)}"}
         send(outbox, {**header, **describe_failure(error, not dies_alone)})
+
+
+def _import_ahead() -> None:
+    """Imports what a training needs, while the parent may still find out what this one is."""
+    configure_jax()
+    for name in AHEAD:
+        importlib.import_module(name)
 
 
 def train_members(job: Job, reporter: Reporter) -> None:
@@ -167,6 +186,7 @@ def read_job(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Job:
 
 
 def main() -> None:
+    gc.disable()  # what is imported and compiled stays; see `PipeReporter.allowance`
     inbox, outbox = child_ends(sys.argv[1:])
     serve(inbox, outbox, dies_alone=True)
 

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sauna.algorithm.policy import compiled_convolution
 from sauna.algorithm.types import Array
 
 LAYERS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))  # features, width of the kernel, stride
@@ -58,6 +57,8 @@ def _by_patches(
     Args:
       of_x: whether x has a gradient.
     """
+    from sauna.algorithm.policy import compiled_convolution  # and Numba, which takes a while
+
     compiled_convolution.register()
     side = [(n - kernel.shape[0]) // stride + 1 for n in x.shape[1:3]]
     out = jax.ShapeDtypeStruct((len(x), *side, kernel.shape[-1]), jnp.float32)
@@ -75,10 +76,12 @@ def _forward(
 def _backward(
     stride: int, rectified: bool, of_x: bool, saved: tuple[Array, Array, Array], cotangent: Array
 ) -> tuple[Array, Array, Array | None]:
+    from sauna.algorithm.policy.compiled_convolution import BACKWARD
+
     kernel, x, out = saved
     shapes = kernel.shape, kernel.shape[-1:], x.shape if of_x else (0,) * 4
     gradients = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    call = jax.ffi.ffi_call(compiled_convolution.BACKWARD, gradients, vmap_method="sequential")
+    call = jax.ffi.ffi_call(BACKWARD, gradients, vmap_method="sequential")
     how = np.array([stride, rectified], np.int32)
     by_kernel, by_bias, by_x = call(kernel, x, out, cotangent, how)
     return by_kernel, by_bias, by_x if of_x else None

@@ -179,16 +179,20 @@ def make_policy(config: Config, spaces: Spaces) -> Policy:
     )
     remembers = state_size(config)
     lead = (1, 1) if remembers else (1,)
-    seen = jnp.zeros((*lead, *spaces.observation_shape), spaces.observation_dtype)
-    example: list[Any] = [seen_of(spaces, seen)]
-    if remembers:
-        example += [jnp.zeros((1, 1), bool), jnp.zeros((1, remembers), jnp.float32)]
-    variables = jax.eval_shape(network.init, jax.random.key(0), *example)
+
+    def new_variables(key: Array) -> Params:
+        seen = jnp.zeros((*lead, *spaces.observation_shape), spaces.observation_dtype)
+        example: list[Any] = [seen_of(spaces, seen)]
+        if remembers:
+            example += [jnp.zeros((1, 1), bool), jnp.zeros((1, remembers), jnp.float32)]
+        return network.init(key, *example)
+
+    variables = jax.eval_shape(lambda: new_variables(jax.random.key(0)))
     check_collections(config, variables)
     unravel = _unraveler(variables)
 
     def init(key: Array) -> Array:
-        return ravel_pytree(network.init(key, *example))[0]
+        return ravel_pytree(new_variables(key))[0]
 
     def apply(params: Array, observation: Array) -> PolicyOutput:
         output = network.apply(unravel(params), seen_of(spaces, observation))

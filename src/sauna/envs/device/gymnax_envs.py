@@ -5,13 +5,17 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import gymnasium
-import gymnax
 import jax
 import numpy as np
-from gymnax.environments import spaces
 
 from sauna.envs.device.contract import JaxEnv, Transition
 from sauna.system.errors import BadInput
+from sauna.system.imports import put_off
+
+# gymnax imports them for its own pictures, and that takes longer than all the rest of it.
+with put_off("matplotlib", "matplotlib.colors", "matplotlib.pyplot", "seaborn"):
+    import gymnax
+    from gymnax.environments import spaces
 
 
 class State(NamedTuple):

@@ -165,7 +165,8 @@ def _devices(config: Config) -> list[Any]:
 def _setting(member: Member) -> Setting:
     values = {name: np.float32(getattr(member.config, name)) for name in Hypers._fields}
     hypers = Hypers(**values)  # type: ignore[arg-type]
-    return Setting(member_keys(member.seed), hypers, jnp.int32(member.config.steps))
+    steps = np.int32(member.config.steps)
+    return Setting(member_keys(member.seed), hypers, steps)  # type: ignore[arg-type]
 
 
 def _report(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -156,6 +157,7 @@ def several(
     Returns:
       the state, and reports with a leading axis `[MAX_PER_CALL]`, `ran` False where none is.
     """
+    iterate = jax.jit(iterate, inline=True)  # traced once, for the shapes and for the loop
     shapes = jax.eval_shape(iterate, state, setting, first)[1]
     empty = jax.tree.map(lambda x: jnp.zeros((MAX_PER_CALL, *x.shape), x.dtype), shapes)
 
@@ -230,7 +232,22 @@ class Population:
         if together:
             self._state = self._init(self._settings)
         else:
+            self._compiling = self._compile_aside(settings[0])
             self._state = [self._init(setting) for setting in settings]
+
+    def _compile_aside(self, setting: Setting) -> Future[tuple[Any, float]]:
+        """Compiles the iteration of one member, while others may make and compile the members.
+
+        Returns:
+          the compiled function, and how many seconds that took.
+        """
+        clock = time.perf_counter()
+        state = jax.eval_shape(self._init, setting)
+        lowered = self._run.lower(state, setting, np.int32(0), np.int32(0))
+        aside = ThreadPoolExecutor(1)
+        compiling = aside.submit(lambda: (lowered.compile(), time.perf_counter() - clock))
+        aside.shutdown(wait=False)
+        return compiling
 
     def over_members(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """A function of one member as one of what a call takes: all members, or one."""
@@ -249,9 +266,12 @@ class Population:
 
     def compile(self) -> float:
         """Compiles the iteration; how many seconds that took (little where it was cached)."""
+        if self._one_by_one:
+            self._run, seconds = self._compiling.result()
+            return seconds
         clock = time.perf_counter()
-        state, setting = self.example()
-        self._run = self._run.lower(state, setting, np.int32(0), np.int32(0)).compile()
+        span = np.int32(0), np.int32(0)
+        self._run = self._run.lower(self._state, self._settings, *span).compile()
         return time.perf_counter() - clock
 
     def run(self, first: int, number: int) -> list[Report]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,14 @@ from jax.flatten_util import ravel_pytree
 from sauna.algorithm.policy.normalize import Moments
 from sauna.algorithm.policy.policy import Policy
 from sauna.algorithm.rollout.collected import Collected
-from sauna.algorithm.rollout.host import HostCollector
 from sauna.algorithm.types import Replay, Rollout, TrainState
 from sauna.envs.host.contract import HostEnvs
 from sauna.system.checkpoint import BadCheckpoint, under
 from sauna.system.errors import SaunaError
 from sauna.training.summary import WINDOW
+
+if TYPE_CHECKING:  # it imports Numba, which a training on the device does not need
+    from sauna.algorithm.rollout.host import HostCollector
 
 
 class NotRestored(SaunaError):
