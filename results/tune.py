@@ -17,6 +17,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from sauna.experiments.tune.fresh import verdict
+
 ROOT = Path(__file__).parent.parent
 START = "--preset mujoco --learning-rate 1e-5"  # 300 times less than the preset's
 TRIALS, MEMBERS, LOCKSTEP = 40, 8, 8
@@ -147,7 +149,7 @@ def search(found: dict[str, Any], folder: Path) -> dict[str, Any]:
         for row in json.loads(path.read_text())["table"]
         if row["label"] == "tuned"
     ]
-    kept = ("metric", "steps", "env_steps", "importance", "fresh_seeds", "verdict", "versions")
+    kept = ("metric", "steps", "env_steps", "importance", "fresh_seeds", "versions")
     tables = {
         name: [{key: row[key] for key in OF_ROWS} for row in found[name].get("table", [])]
         for name in ("finalists", "fresh")
@@ -155,11 +157,12 @@ def search(found: dict[str, Any], folder: Path) -> dict[str, Any]:
     highest = [{key: row[key] for key in OF_ROWS} for row in earlier]
     return {
         **{name: found[name] for name in kept},
+        "verdict": verdict(found["fresh"]),  # as it is judged today
         "best": found["best"] and found["best"]["number"],
         "settings": found["best"] and found["best"]["settings"],
         **tables,
         "highest_score_on_fresh_seeds": highest,
-        "verdicts": [verdict["text"] for verdict in found["fresh"].get("verdicts", [])],
+        "verdicts": [said["text"] for said in found["fresh"].get("verdicts", [])],
         "trials": [{key: t[key] for key in KEPT if key in t} for t in found["trials"]],
     }
 

@@ -17,7 +17,7 @@ from sauna.api import train as train_run
 from sauna.experiments.tune import command, search, storage
 from sauna.experiments.tune.batch import prepared_batch
 from sauna.experiments.tune.command import tune
-from sauna.experiments.tune.fresh import fresh_spec
+from sauna.experiments.tune.fresh import fresh_spec, verdict
 from sauna.experiments.tune.plan import make_plan
 from sauna.system import run_directory
 from sauna.system.errors import BadInput, Interrupted, SaunaError
@@ -254,8 +254,16 @@ def test_what_was_found_is_tried_on_fresh_seeds(tmp_path: Path, capsys) -> None:
     assert [f"trial {trial['number']}" for trial in best] == list(means)
     assert f"trial {found['best']['number']}" == max(means, key=lambda label: means[label])
     assert (folder / found["fresh"]["report"]).is_file()
-    better = table["tuned"]["final_mean"] >= table["start"]["final_mean"]
+    better = table["tuned"]["improvement"][0] >= 0.5
     assert found["verdict"]["believed"] == better and "of start" in found["verdict"]["text"]
+
+
+@pytest.mark.parametrize("chance, believed", [(0.5, True), (0.48, False), (None, None)])
+def test_what_was_found_is_believed_by_its_probability_of_improvement(chance, believed) -> None:
+    """Not by the mean, which one seed may decide."""
+    preset = {"label": "preset mujoco", "final_mean": 1.0, "improvement": None}
+    tuned = {"label": "tuned", "final_mean": 0.5, "improvement": [chance, chance, chance]}
+    assert verdict({"table": [preset, tuned]})["believed"] is believed
 
 
 def test_the_fresh_seeds_compare_with_the_preset_that_the_task_has_by_itself() -> None:

@@ -160,8 +160,8 @@ def _read(spec: Spec, folder: Path) -> dict[str, Any]:
 def verdict(fresh: Mapping[str, Any]) -> dict[str, Any]:
     """Says what the fresh seeds say of what was found: whether it is believed, and why.
 
-    It is believed if its mean is at least that of the preset on the same seeds, or of the start if
-    the preset cannot be trained for so few steps.
+    It is believed if its probability of improvement over the preset on the same seeds is at least
+    one half, or over the start if the preset cannot be trained for so few steps.
     """
     if not fresh:
         return {"believed": None, "text": "not tried on fresh seeds"}
@@ -171,14 +171,16 @@ def verdict(fresh: Mapping[str, Any]) -> dict[str, Any]:
     if tuned is None:
         same = START if START in rows else against["label"]
         return {"believed": False, "text": f"what was found is the {same} itself"}
-    if tuned["final_mean"] is None or against["final_mean"] is None:
+    chance, low, high = tuned["improvement"] or [None] * 3
+    if chance is None or None in (tuned["final_mean"], against["final_mean"]):
         return {"believed": None, "text": "the trainings on fresh seeds did not all end"}
-    believed = tuned["final_mean"] >= against["final_mean"]
-    means = f"{tuned['final_mean']:.4g} against {against['final_mean']:.4g} of {against['label']}"
-    text = f"mean final return on fresh seeds: {means}"
     return {
-        "believed": believed,
-        "text": text if believed else f"{text}, which is higher",
+        "believed": chance >= 0.5,
+        "text": (
+            f"mean final return on fresh seeds: {tuned['final_mean']:.4g} against "
+            f"{against['final_mean']:.4g} of {against['label']}; probability of improvement "
+            f"{chance:.2f} [{low:.2f}, {high:.2f}]"
+        ),
     }
 
 
