@@ -74,6 +74,23 @@ def test_what_is_imported_ahead_of_a_job_leaves_its_devices_open() -> None:
     ]
 
 
+def test_a_program_that_compiles_in_no_time_is_read_from_the_cache_as_well(tmp_path: Path) -> None:
+    code = (
+        "from sauna.system.jax_setup import configure_jax\nconfigure_jax()\n"
+        "import jax\nseen = []\n"
+        "jax.monitoring.register_event_listener(lambda event, **more: seen.append(event))\n"
+        "for n in range(5): jax.jit(lambda x: x + n)(1.0)\n"
+        "print(sum(event.endswith('cache_hits') for event in seen))"
+    )
+    own = {name: value for name, value in environment().items() if not name.startswith("JAX_")}
+    own["XDG_CACHE_HOME"] = str(tmp_path)
+    hits = [
+        int(subprocess.check_output([sys.executable, "-c", code], text=True, env=own))
+        for _ in range(2)
+    ]
+    assert hits[0] == 0 and hits[1] >= 5
+
+
 @pytest.mark.processes
 def test_the_process_that_is_started_with_the_command_trains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
