@@ -37,7 +37,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import optax  # noqa: E402
-from make import BOUNDED, RESULTS  # noqa: E402
+from make import BOUNDED, MEASURED, RESULTS  # noqa: E402
 from selection import CHEETAH, PONG, config_of, least_of_a_block, one_update  # noqa: E402
 
 from sauna.algorithm.learner.optimizers import optimizer, scaling  # noqa: E402
@@ -271,11 +271,18 @@ def operations_of_an_env_step(name: str) -> int:
     stored = json.loads((RESULTS / f"{name}.json").read_text())
     settings = stored["peer"]["settings"]
     if stored["env"].startswith("ALE/"):
-        return convolutions_of(PONG) * settings["epochs"]
+        return round(convolutions_of(PONG) * settings["epochs"] * share_of(MEASURED[name]))
     hidden = ",".join(map(str, settings["hidden"]))
     run = {"env": stored["env"], "env_kwargs": settings.get("env_kwargs", "{}"), "hidden": hidden}
     job = prepare({**run, "trunk": settings.get("trunk", "separate")}).job()
     return operations(layers(job.config, job.spaces)) * settings["epochs"]
+
+
+def share_of(flags: Sequence[str]) -> float:
+    """The share of the samples that a row of `make.py` learns from, by its flags."""
+    if "--sampler-kwargs" not in flags:
+        return 1.0
+    return float(json.loads(flags[flags.index("--sampler-kwargs") + 1])["share"])
 
 
 def main() -> None:
