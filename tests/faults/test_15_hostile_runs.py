@@ -107,7 +107,8 @@ def main() -> None:
 
     from sauna.config.trust import key_file, seal
 
-    for module in ("sauna.cli", "sauna.experiments.study.command"):
+    # The last is imported by `importlib.resources`, at its first use.
+    for module in ("sauna.cli", "sauna.experiments.study.command", "importlib.readers"):
         import_module(module)
     seal({"env": "a:b"})  # makes the key
     folders = json.loads(Path(sys.argv[1]).read_text())
