@@ -156,6 +156,8 @@ def measure(names: Sequence[str]) -> None:
             command += ["--script", str(Path(os.environ["PUREJAXRL"]) / "ppo.py")]
         file = str(RESULTS / f"{name}.json")
         subprocess.run([*command, "--json", file], check=True, cwd=ROOT / "benchmarks")
+    count = [sys.executable, "peak.py", "--bounds"]  # operations of the rows that are new
+    subprocess.run(count, check=True, cwd=ROOT / "benchmarks")
 
 
 def measure_filtered() -> None:
@@ -200,7 +202,7 @@ def others_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
     ]
     for name, one in found.items():
         rates, own = sorted(one["rates"]["training"]), one["peer"]["settings"]
-        env = one["env"] + (", 1 ms a step" if "milliseconds" in own["env_kwargs"] else "")
+        env = one["env"] + (", 1 ms a step" if "milliseconds" in own.get("env_kwargs", "") else "")
         network = "-".join(map(str, own["hidden"]))
         lines.append(
             f"| {env} | {own['envs']} x {own['rollout_steps']}, {own['epochs']}, {network} | "
@@ -269,7 +271,7 @@ def device_beside_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) 
 def _training(one: dict[str, Any]) -> str:
     """What was trained, by its environment and network."""
     settings = one["peer"]["settings"]
-    env = one["env"] + (", 1 ms a step" if "milliseconds" in settings["env_kwargs"] else "")
+    env = one["env"] + (", 1 ms a step" if "milliseconds" in settings.get("env_kwargs", "") else "")
     if one["env"].startswith("ALE/"):
         return f"{env}, {', '.join(one['arm'])}"
     return f"{env}, {'-'.join(map(str, settings['hidden']))}"
