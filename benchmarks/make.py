@@ -202,7 +202,7 @@ def others_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) -> str:
     ]
     for name, one in found.items():
         rates, own = sorted(one["rates"]["training"]), one["peer"]["settings"]
-        env = one["env"] + (", 1 ms a step" if "milliseconds" in own.get("env_kwargs", "") else "")
+        env = _environment(one)
         network = "-".join(map(str, own["hidden"]))
         lines.append(
             f"| {env} | {own['envs']} x {own['rollout_steps']}, {own['epochs']}, {network} | "
@@ -268,13 +268,16 @@ def device_beside_table(found: dict[str, dict[str, Any]], peak: dict[str, Any]) 
     return "\n".join(lines)
 
 
+def _environment(one: dict[str, Any]) -> str:
+    slow = "milliseconds" in one["peer"]["settings"].get("env_kwargs", "")
+    return one["env"] + (", 1 ms a step" if slow else "")
+
+
 def _training(one: dict[str, Any]) -> str:
     """What was trained, by its environment and network."""
-    settings = one["peer"]["settings"]
-    env = one["env"] + (", 1 ms a step" if "milliseconds" in settings.get("env_kwargs", "") else "")
     if one["env"].startswith("ALE/"):
-        return f"{env}, {', '.join(one['arm'])}"
-    return f"{env}, {'-'.join(map(str, settings['hidden']))}"
+        return f"{_environment(one)}, {', '.join(one['arm'])}"
+    return f"{_environment(one)}, {'-'.join(map(str, one['peer']['settings']['hidden']))}"
 
 
 def peers_table(found: dict[str, dict[str, Any]]) -> str:

@@ -319,18 +319,8 @@ MUTANTS = [
     *_of(
         "algorithm/policy/compiled_convolution.py",
         "convolutions networks",
-        (
-            "kernel upside down",
-            "line = lines[b * x.shape[1] + i * stride + k]\n"
-            "                begin = (((b - first) * rows + i) * columns * width + k) * run\n"
-            "                for j in range(columns):\n"
-            "                    to",
-            "line = lines[b * x.shape[1] + i * stride + width - 1 - k]\n"
-            "                begin = (((b - first) * rows + i) * columns * width + k) * run\n"
-            "                for j in range(columns):\n"
-            "                    to",
-        ),
-        ("overlapping patches not added", "to[c] += of[c]", "to[c] = of[c]"),
+        ("kernel upside down", "i * stride + k]", "i * stride + width - 1 - k]"),
+        ("overlapping patches not added", "pixels[c] += patch[c]", "pixels[c] = patch[c]"),
         ("dead units learn", "output[begin + i, j] > 0.0 or not rectified", "True"),
         ("gradient of the last turn only", "total[i, j] += part[i, j]", "total[i, j] = part[i, j]"),
         (

@@ -69,7 +69,7 @@ def convolve(kernel: Any, bias: Any, x: Any, stride: int, rectified: int, out: A
     patches = np.empty((pictures * pixels, inputs), np.float32)
     for first in range(0, count, pictures):
         last = min(first + pictures, count)
-        unfold(x, first, last, width, stride, out.shape[1], out.shape[2], patches)
+        exchange(x, first, last, width, stride, *out.shape[1:3], patches, False)
         rows = output[first * pixels : last * pixels]
         np.dot(patches[: len(rows)], weights, rows)
         for i in range(len(rows)):
@@ -118,14 +118,14 @@ def convolve_back(
                 passes = output[begin + i, j] > 0.0 or not rectified
                 delta[i, j] = arriving[begin + i, j] if passes else np.float32(0.0)
                 sums[j] += delta[i, j]
-        unfold(x, first, last, width, stride, out.shape[1], out.shape[2], patches)
+        exchange(x, first, last, width, stride, *out.shape[1:3], patches, False)
         np.dot(patches[:n].T, delta[:n], part)
         for i in range(inputs):
             for j in range(features):
                 total[i, j] += part[i, j]
         if of_x.size:
             np.dot(delta[:n], weights.T, patches[:n])
-            fold(patches, first, last, width, stride, out.shape[1], out.shape[2], of_x)
+            exchange(of_x, first, last, width, stride, *out.shape[1:3], patches, True)
     of_bias[:] = sums
 
 
@@ -136,10 +136,19 @@ def of_a_turn(numbers: int, count: int) -> int:
 
 
 @compiled
-def unfold(
-    x: Any, first: int, last: int, width: int, stride: int, rows: int, columns: int, patches: Any
+def exchange(
+    x: Any,
+    first: int,
+    last: int,
+    width: int,
+    stride: int,
+    rows: int,
+    columns: int,
+    patches: Any,
+    back: bool,
 ) -> None:
-    """Writes a row of `patches` for each position of the kernel in x from picture `first` on.
+    """Copies pixels of x to `patches`, a row for each position of the kernel from picture `first`
+    on; `back`: adds each row to the pixels that it is taken from.
 
     Args:
       x: `[B, H, W, C]`.
@@ -155,30 +164,14 @@ def unfold(
                 line = lines[b * x.shape[1] + i * stride + k]
                 begin = (((b - first) * rows + i) * columns * width + k) * run
                 for j in range(columns):
-                    to = numbers[begin + j * width * run : begin + (j * width + 1) * run]
-                    of = line[j * step : j * step + run]
-                    for c in range(run):
-                        to[c] = of[c]
-
-
-@compiled
-def fold(
-    patches: Any, first: int, last: int, width: int, stride: int, rows: int, columns: int, x: Any
-) -> None:
-    """Adds each row of `patches` to the pixels of x that `unfold` takes it from."""
-    run = width * x.shape[3]
-    step = stride * x.shape[3]
-    lines, numbers = x.reshape(x.shape[0] * x.shape[1], -1), patches.reshape(-1)
-    for b in range(first, last):
-        for i in range(rows):
-            for k in range(width):
-                line = lines[b * x.shape[1] + i * stride + k]
-                begin = (((b - first) * rows + i) * columns * width + k) * run
-                for j in range(columns):
-                    of = numbers[begin + j * width * run : begin + (j * width + 1) * run]
-                    to = line[j * step : j * step + run]
-                    for c in range(run):
-                        to[c] += of[c]
+                    patch = numbers[begin + j * width * run : begin + (j * width + 1) * run]
+                    pixels = line[j * step : j * step + run]
+                    if back:
+                        for c in range(run):
+                            pixels[c] += patch[c]
+                    else:
+                        for c in range(run):
+                            patch[c] = pixels[c]
 
 
 def _pointer_to(kind: Any) -> Any:

@@ -7,6 +7,7 @@ on a CPU a compiled function of our own takes its place.
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,13 +58,19 @@ def _by_patches(
     Args:
       of_x: whether x has a gradient.
     """
+    side = [(n - kernel.shape[0]) // stride + 1 for n in x.shape[1:3]]
+    out = jax.ShapeDtypeStruct((len(x), *side, kernel.shape[-1]), jnp.float32)
+    return _call("FORWARD", out, (kernel, bias, x), stride, rectified)
+
+
+def _call(which: str, results: Any, given: tuple[Array, ...], stride: int, rectified: bool) -> Any:
+    """Calls `FORWARD` or `BACKWARD` of `compiled_convolution`; returns arrays like `results`."""
     from sauna.algorithm.policy import compiled_convolution  # and Numba, which takes a while
 
     compiled_convolution.register()
-    side = [(n - kernel.shape[0]) // stride + 1 for n in x.shape[1:3]]
-    out = jax.ShapeDtypeStruct((len(x), *side, kernel.shape[-1]), jnp.float32)
-    call = jax.ffi.ffi_call(compiled_convolution.FORWARD, out, vmap_method="sequential")
-    return call(kernel, bias, x, np.array([stride, rectified], np.int32))
+    name = getattr(compiled_convolution, which)
+    call = jax.ffi.ffi_call(name, results, vmap_method="sequential")
+    return call(*given, np.array([stride, rectified], np.int32))
 
 
 def _forward(
@@ -76,14 +83,11 @@ def _forward(
 def _backward(
     stride: int, rectified: bool, of_x: bool, saved: tuple[Array, Array, Array], cotangent: Array
 ) -> tuple[Array, Array, Array | None]:
-    from sauna.algorithm.policy.compiled_convolution import BACKWARD
-
     kernel, x, out = saved
     shapes = kernel.shape, kernel.shape[-1:], x.shape if of_x else (0,) * 4
     gradients = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    call = jax.ffi.ffi_call(BACKWARD, gradients, vmap_method="sequential")
-    how = np.array([stride, rectified], np.int32)
-    by_kernel, by_bias, by_x = call(kernel, x, out, cotangent, how)
+    given = kernel, x, out, cotangent
+    by_kernel, by_bias, by_x = _call("BACKWARD", gradients, given, stride, rectified)
     return by_kernel, by_bias, by_x if of_x else None
 
 
