@@ -80,6 +80,23 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
     # PPO's published numbers but for the discount, which is RL Zoo's. At 0.99 a stroke's gain lies
     # too far ahead to be seen.
     "swimmer": {"gamma": 0.9999},
+    # RL Zoo's networks do not begin orthogonal.
+    "half-cheetah": {
+        **_NORMALIZED,
+        "rollout_steps": 512,
+        "minibatches": 8,
+        "epochs": 20,
+        "learning_rate": 2.0633e-5,
+        "gamma": 0.98,
+        "gae_lambda": 0.92,
+        "clip_range": 0.1,
+        "entropy_coef": 0.000401762,
+        "value_coef": 1.16192,
+        "max_grad_norm": 0.8,
+        "hidden": (256, 256),
+        "activation": "relu",
+        "log_std_init": -2.0,
+    },
     "lunar-lander": {
         **_SB3,
         "envs": 16,
@@ -163,6 +180,7 @@ TASK_PRESET_HELP = {
     "mountain-car-continuous": "MountainCarContinuous: wide actions at first",
     "pendulum": "Pendulum with RL Zoo's numbers",
     "swimmer": "Swimmer: as mujoco, with RL Zoo's discount",
+    "half-cheetah": "HalfCheetah with RL Zoo's numbers",
     "lunar-lander": "LunarLander, both forms, with RL Zoo's numbers",
     "bipedal-walker": "BipedalWalker with RL Zoo's numbers",
     "bipedal-walker-hardcore": "BipedalWalkerHardcore with RL Zoo's numbers",
