@@ -236,3 +236,22 @@ choosy = JaxEnv(reset, _masked_step, _BOX, gymnasium.spaces.MultiDiscrete([3, 2]
 choosy = choosy._replace(action_mask=_valid)
 # The same, in whose fourth state no action is valid.
 stuck = choosy._replace(action_mask=lambda state: _valid(state) & (state.steps != 3))
+
+
+def shade(kind: str = "uint8") -> JaxEnv:
+    """Pictures `[40, 40, 1]` of one shade, which gets brighter with each step."""
+    most = 255 if kind == "uint8" else 1
+    space = gymnasium.spaces.Box(0, most, (40, 40, 1), np.dtype(kind))
+
+    def observe(state: State) -> jax.Array:
+        return jnp.full((40, 40, 1), most * state.steps / LENGTH).astype(kind)
+
+    def begin(key: jax.Array) -> tuple[State, jax.Array]:
+        state, _ = reset(key)
+        return state, observe(state)
+
+    def go_on(state: State, action: jax.Array) -> Transition:
+        after = step(state, jnp.float32(action)[None])
+        return after._replace(observation=observe(after.state))
+
+    return JaxEnv(begin, go_on, space, gymnasium.spaces.Discrete(2))

@@ -7,6 +7,7 @@ import copy
 import jax
 import numpy as np
 import pytest
+from gymnasium import spaces as gym
 
 import jax_envs
 import sauna
@@ -18,12 +19,14 @@ from sauna.envs.device.stacked import stacked
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.make import in_process_envs, make_env
 from sauna.envs.masked import MaskedEnv
+from sauna.envs.spaces import describe
 from sauna.envs.stacked import StackedEnv, StackedSpace
 from sauna.envs.wrapping import Wrapping, read_wrapping
 from sauna.system.errors import BadInput
-from small_envs import Finite
+from small_envs import Finite, Picture
 
 ORDERED = ("wrappers:Double", "wrappers:plus_one")
+FRAMES = [[0, 1, 0, 1, 0, 1], [0, 1, 0, 1, 20, 21], [0, 1, 20, 21, 40, 41]]
 
 
 def test_the_last_observations_are_one_also_at_both_ends_of_an_episode() -> None:
@@ -86,9 +89,45 @@ def test_a_policy_makes_the_environment_that_it_was_trained_on(tmp_path) -> None
     assert made.step(0)[1] == 2.0
 
 
-def test_pictures_are_not_stacked() -> None:
-    with pytest.raises(BadInput, match="stack: pictures are not stacked"):
-        make_job("small_envs:Picture", arm="ppo", stack=2, network="auto")
+def test_the_channels_of_pictures_stand_side_by_side() -> None:
+    """The pictures `[2, 40, 40]` of step t have 20 t and 20 t + 1 as their two channels."""
+    env = StackedEnv(Picture(), 3)
+    kind = describe(env.observation_space, env.action_space)
+    assert (kind.observation_kind, kind.observation_shape) == ("image", (40, 40, 6))
+    for _ in range(2):
+        seen = [env.reset(seed=1)[0], *(env.step(5)[0] for _ in range(2))]
+        for picture, channels in zip(seen, FRAMES, strict=True):
+            assert picture.dtype == np.uint8 and picture.shape == (40, 40, 6)
+            assert np.unique(picture.reshape(-1, 6), axis=0).tolist() == [channels]
+    with pytest.raises(BadInput, match="stack: 8 channels of 5 x 7 pixels would be read as"):
+        StackedSpace(gym.Box(0, 255, (5, 7, 4), np.uint8), gym.Discrete(2), 2)
+    made = StackedSpace(gym.Box(0.0, 1.0, (40, 40), np.float32), gym.Discrete(2), 2)
+    assert describe(made, gym.Discrete(2)).observation_kind == "float_image"
+
+
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_the_device_stacks_pictures_as_the_host_does(kind: str) -> None:
+    one = jax_envs.shade(kind)
+    face, theirs = HostFace(stacked(one, 3)), StackedEnv(HostFace(one), 3)
+    assert face.observation_space == theirs.observation_space
+    pairs = [(face.reset(seed=4)[0], theirs.reset(seed=4)[0])]
+    pairs += [(face.step(1)[0], theirs.step(1)[0]) for _ in range(3)]
+    for ours, other in pairs:
+        assert ours.dtype == other.dtype == kind and ours.shape == (40, 40, 3)
+        np.testing.assert_array_equal(ours, other)
+    assert len(np.unique(pairs[-1][0])) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["host", "device"])
+def test_stacked_pictures_train_and_resume_exactly(place: str) -> None:
+    env = {"host": "small_envs:Picture", "device": "jax_envs:shade"}[place]
+    job = make_job(env, arm="ppo", stack=2, network="auto")
+    whole, first = train_here(job), train_here(job, 2)
+    again = train_here(resumed(job, first))
+    assert equal(again.final, whole.final) and first.rows + again.rows == whole.rows
+    channels = {"host": 4, "device": 2}[place]
+    assert whole.final["ppo/0/params/policy_trunk/conv_0/kernel"].shape[2] == channels
 
 
 def test_a_users_wrappers_go_around_every_environment_in_their_order() -> None:
@@ -120,6 +159,8 @@ REFUSED = [
     ({"env": "jax_envs:walk", "wrap": ORDERED[0]}, "wrap: not read by arm ppo; .* on the host"),
     ({"env": "vector_envs:same", "wrap": ORDERED[0]}, "wrap: the rows of vector_envs:same are"),
     ({"env": "vector_envs:Agents", "stack": 2}, "stack: the rows of vector_envs:Agents are"),
+    ({"env": "small_envs:Camera", "stack": 2}, "stack: a Dict or Tuple with pictures is not"),
+    ({"env": "ALE/Pong-v5", "stack": 2}, "stack: .* Atari game is its last four frames already"),
 ]
 
 

@@ -109,6 +109,8 @@ def check_consistent(config: Config) -> None:
         )
     if config.env_processes > config.envs * len(config.seeds) * len(config.arm):
         raise BadInput("env_processes: more worker processes than environments")
+    if config.stack > 1 and config.env.startswith("ALE/"):
+        raise BadInput("stack: an observation of an Atari game is its last four frames already")
     check_rate(config)
     check_rules(config)
     check_recurrent(config)

@@ -34,9 +34,7 @@ class RunOptions:
         "module:function, ...: each takes an environment and gives one, the first the innermost",
         read_when=readers.ON_HOST,
     )
-    stack: int = _task(
-        1, "how many of the last observations, as vectors, are shown as one", at_least=1
-    )
+    stack: int = _task(1, "how many of the last observations are shown as one", at_least=1)
     action_mask: bool = _task(
         False,
         "learn and act by the environment's masks of valid actions: action_masks(), or "

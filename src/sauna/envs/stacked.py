@@ -1,7 +1,7 @@
-"""The last observations as one: one vector shows how things are, several show how they move.
+"""The last observations as one: one shows how things are, several show how they move.
 
-Where an episode starts, its first observation stands for those before it, too. The oldest comes
-first.
+Vectors stand side by side, and so do the channels of pictures. The oldest comes first. Where an
+episode starts, its first observation stands for those before it, too.
 """
 
 from __future__ import annotations
@@ -11,29 +11,37 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces as gym
 
-from sauna.envs.spaces import describe, observation_reader
+from sauna.envs.pictures import channels_first
+from sauna.envs.spaces import PICTURES, describe, observation_reader
 from sauna.system.errors import BadInput
 
 
 class StackedSpace(gym.Box):
-    """`number` observations of a space, each flattened, side by side."""
+    """`number` observations `[D]` as `[number * D]`, or pictures `[H, W, C]` as
+    `[H, W, number * C]`."""
 
     def __init__(self, space: Any, action_space: Any, number: int) -> None:
         spaces = describe(space, action_space)
-        if spaces.picture_shapes:
+        if spaces.pictures:
+            raise BadInput("stack: a Dict or Tuple with pictures is not stacked")
+        *rest, last = spaces.observation_shape
+        shape = (*rest, number * last)
+        if channels_first(shape):
             raise BadInput(
-                "stack: pictures are not stacked; gymnasium.wrappers.FrameStackObservation does "
-                "so, and Atari's come as four frames"
+                f"stack: {shape[2]} channels of {shape[0]} x {shape[1]} pixels would be read as "
+                "a picture whose channels come first"
             )
-        size = number * spaces.observation_shape[0]
-        super().__init__(-np.inf, np.inf, (size,), np.float64)
+        if spaces.observation_kind in PICTURES:
+            super().__init__(0, space.high.max(), shape, space.dtype)
+        else:
+            super().__init__(-np.inf, np.inf, shape, np.float64)
 
 
 def stacked_space(space: Any, action_space: Any, number: int) -> Any:
     """The space of stacked observations, unless it is one already.
 
     Raises:
-      BadInput: the observations are pictures.
+      BadInput: the observations cannot be stacked.
     """
     if isinstance(space, StackedSpace):
         return space
@@ -41,32 +49,35 @@ def stacked_space(space: Any, action_space: Any, number: int) -> Any:
 
 
 class StackedEnv:
-    """An environment that shows its last `number` observations as one vector.
+    """An environment that shows its last `number` observations as one.
 
     Raises:
-      BadInput: its observations are pictures.
+      BadInput: its observations cannot be stacked.
     """
 
     def __init__(self, env: Any, number: int) -> None:
         self.env = env
         self.observation_space = StackedSpace(env.observation_space, env.action_space, number)
         self._read = observation_reader(env.observation_space)
-        self._seen = np.zeros((number, self.observation_space.shape[0] // number))
+        self._seen = np.zeros(self.observation_space.shape, self.observation_space.dtype)
+        self._new = self._seen.shape[-1] // number
 
     def reset(self, **how: Any) -> Any:
         answer = self.env.reset(**how)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             return answer  # refused by who reads it
-        self._seen[:] = self._read(answer[0])
-        return self._seen.reshape(-1).copy(), answer[1]
+        first = self._read(answer[0])
+        for begin in range(0, self._seen.shape[-1], self._new):
+            self._seen[..., begin : begin + self._new] = first
+        return self._seen.copy(), answer[1]
 
     def step(self, action: Any) -> Any:
         answer = self.env.step(action)
         if not (isinstance(answer, tuple) and len(answer) == 5):
             return answer
-        self._seen[:-1] = self._seen[1:]
-        self._seen[-1] = self._read(answer[0])
-        return self._seen.reshape(-1).copy(), *answer[1:]
+        self._seen[..., : -self._new] = self._seen[..., self._new :]
+        self._seen[..., -self._new :] = self._read(answer[0])
+        return self._seen.copy(), *answer[1:]
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # also of a copy that is not complete yet
