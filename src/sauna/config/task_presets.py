@@ -123,10 +123,11 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
         "clip_range_schedule": "linear",
         "entropy_coef": 0.001,
     },
-    # RL Zoo repeats each action twice, and learns from two grey pictures of 64 x 64 pixels by GELU
-    # layers of 256 units. Here: every picture as it comes, 96 x 96 in colour, and the Nature CNN.
+    # RL Zoo's network has GELU layers of 256 units behind its convolutions. Here: the Nature CNN.
     "car-racing": {
         **_SB3,
+        "wrap": ("sauna.envs.small_grey:SmallGrey",),
+        "stack": 2,
         "envs": 8,
         "rollout_steps": 512,
         "minibatches": 32,
@@ -184,7 +185,7 @@ TASK_PRESET_HELP = {
     "lunar-lander": "LunarLander, both forms, with RL Zoo's numbers",
     "bipedal-walker": "BipedalWalker with RL Zoo's numbers",
     "bipedal-walker-hardcore": "BipedalWalkerHardcore with RL Zoo's numbers",
-    "car-racing": "CarRacing with RL Zoo's numbers, on single pictures in colour",
+    "car-racing": "CarRacing with RL Zoo's numbers: pairs of small grey pictures",
     "minigrid": "MiniGrid with RL Zoo's numbers",
     "minigrid-long": "the same with rollouts of 512 steps (FourRooms, RedBlueDoors)",
     "playground": "MuJoCo Playground's control tasks: 2048 environments on an accelerator",

@@ -25,6 +25,7 @@ from sauna.system.safe_read import read_file
 from sauna.system.safe_write import open_new, sync_folder
 
 FIELDS = (*fields_with("plugin"), "tasks", "measure", "track", "wrap")  # that may name code
+OWN_WRAPPERS = ("sauna.envs.small_grey:SmallGrey",)  # which a preset names
 # Ids of Gymnasium whose arguments name an environment of another library.
 WRAPPERS = ("GymV21Environment", "GymV26Environment")
 KEY_BYTES = 32
@@ -48,6 +49,7 @@ def _named(value: Any, field: str) -> Iterator[tuple[str, str]]:
             yield from _named(part, field)
     elif isinstance(value, str) and field in FIELDS:
         names = ":" in value and not is_local(value)
+        names = names and not (field == "wrap" and value in OWN_WRAPPERS)
         if names or any(wrapper in value for wrapper in WRAPPERS):
             yield ("env" if field == "tasks" else field), value
 
