@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from studies import listed, load, markdown, page
-from zoo import TRAINED, plan_of
+from zoo import SHORTER, TRAINED, plan_of, planned
 
 from sauna.config.zoo import ENVS, PUBLISHED, entry_of, shown_published
 from sauna.experiments.report import style
@@ -42,6 +42,7 @@ def zoo_page(units: Mapping[str, Any]) -> str:
         table=markdown([HEAD, *(_row(env, units[env]) for env in done)]),
         words=listed(below) if below else "None so far.",
         seconds=_seconds(),
+        shorter=" ".join(map(_shorter, SHORTER)),
         planned=f"{len(TRAINED)} of the {len(ENVS)} environments",
         missing=markdown(
             [["Environment", "Preset", "Env steps", "RL Zoo", "Why"], *map(_missing, missing)]
@@ -81,9 +82,14 @@ def _published(env: str) -> str:
 
 
 def _missing(env: str) -> list[str]:
+    entry = planned(env)
+    return [f"`{env}`", f"`{entry.preset}`", f"{entry.steps:,}", _published(env), plan_of(env)]
+
+
+def _shorter(env: str) -> str:
     entry = entry_of(env)
     assert entry is not None
-    return [f"`{env}`", f"`{entry.preset}`", f"{entry.steps:,}", _published(env), plan_of(env)]
+    return f"`{env}`: {SHORTER[env]:,} instead of {entry.steps:,}."
 
 
 def is_below(env: str, unit: Mapping[str, Any]) -> bool:
