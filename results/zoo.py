@@ -5,9 +5,9 @@
     python results/zoo.py --list             what there is, and what is done
 
 Each environment is one unit: one run of three seeds with the preset and the env steps that
-`sauna train` picks (fewer of `SHORTER`), then 20 episodes per seed with the most likely action. Runs stay in
-`runs/zoo/`; `results/zoo.json` gets the returns, the times and a thinned curve. A unit that was
-interrupted goes on where it was. One whose preset has changed since is trained again.
+`sauna train` picks (fewer of `SHORTER`), then 20 episodes per seed with the most likely action.
+Runs stay in `runs/zoo/`; `results/zoo.json` gets the returns, the times and a thinned curve. A unit
+that was interrupted goes on where it was. One whose preset has changed since is trained again.
 """
 
 from __future__ import annotations
