@@ -65,6 +65,7 @@ TRAINED = (  # cheapest first
     "Pusher-v5",
     "Ant-v5",
     "PointMaze_UMazeDense-v3",
+    "FetchReachDense-v4",
     "Humanoid-v5",
     "HumanoidStandup-v5",
     "MiniGrid-KeyCorridorS3R1-v0",
@@ -81,7 +82,6 @@ SHORTER = {"CarRacing-v3": 100_000}  # env steps, where those of `sauna train` t
 LEFT_OUT = {
     r"ALE/.+|BipedalWalkerHardcore-v3|sauna/HumanoidFlagrunHarder-v0": "days on two cores",
     r"playground/.+": "needs an accelerator",
-    r"FetchReachDense-v4": "needs MuJoCo 3",
     r"MiniGrid-(?:FourRooms|GoToDoor|PutNear).+": "hours on two cores",
     r"MiniGrid-(?:LockedRoom|MultiRoom|ObstructedMaze).+": "hours; RL Zoo calls it unsolved",
 }

@@ -92,9 +92,10 @@ BAD = [
     (["train", ENV, "--batch-size", "64", "--minibatches", "2"], "either batch_size or minib"),
     (["train", ENV, "--seed", "1", "--seeds", "2"], "either seed or seeds, not both"),
     (["train", ENV, "--target-kl", "0"], "target_kl: must be a number above 0"),
-    (["train", ENV, "--target-kl", "x"], "target_kl: cannot read 'x' as float"),
+    (["train", ENV, "--target-kl", "x"], "target_kl: cannot read 'x' as a number"),
     (["train", ENV, "--target-kl", "0.01", "--stop", "espo"], "either target_kl or stop"),
     (["train", ENV, "--target-kl", "0.01", "--algorithm", "a2c"], "stop: not read"),
+    (["train", ENV, "--eval-every", "512", "--stop-at", "x"], "stop_at: cannot read 'x' as a num"),
     (["train", ENV, "--optimizer", "adamv"], "did you mean 'adam'"),
     (["train", ENV, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),
     (

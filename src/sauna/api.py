@@ -50,10 +50,15 @@ class Result:
 
     Args:
       path: the run directory.
+
+    Raises:
+      BadInput: there is no run.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        if not (self.path / "config.json").is_file():
+            raise BadInput(f"{self.path} is no run: it has no config.json")
 
     @property
     def metrics(self) -> list[dict[str, Any]]:

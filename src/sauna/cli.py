@@ -275,7 +275,11 @@ def _train(values: dict[str, Any]) -> None:
     if picked.said:
         display.say(f"the settings of {file} over {picked.said}" if stored else picked.said)
     train_and_draw(run, display, resume=False)
-    curve = run.path / "figures" / "learning_curve.png"
+    _print_curve(run.path)
+
+
+def _print_curve(run: Path) -> None:
+    curve = run / "figures" / "learning_curve.png"
     print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
 
 
@@ -310,6 +314,7 @@ def _resume(values: dict[str, Any]) -> None:
     display = make_display()
     run = runs.reopen(path, values, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact)
+    _print_curve(path)
 
 
 def _eval(values: dict[str, Any]) -> None:

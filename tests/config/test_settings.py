@@ -9,12 +9,26 @@ import pytest
 from sauna.config import presets
 from sauna.config.checks import check_read, check_read_here, is_read
 from sauna.config.fields import GROUPS
-from sauna.config.settings import FIELDS, FILTERS, VEX_TARGETS, Config, fields_with
+from sauna.config.settings import (
+    FIELDS,
+    FILTERS,
+    TYPES,
+    VEX_TARGETS,
+    Config,
+    fields_with,
+    parse,
+)
 from sauna.envs.spaces import Spaces
 from sauna.system.errors import BadInput
 
 DISCRETE = Spaces("vector", (3,), "discrete", (2,), "", "")
 PICTURES = Spaces("image", (84, 84, 4), "continuous", (2,), "", "")
+
+
+@pytest.mark.parametrize("name", [name for name, kind in TYPES.items() if kind is not str])
+def test_what_cannot_be_read_is_answered_with_what_is_expected(name: str) -> None:
+    with pytest.raises(BadInput, match=f"^{name}: cannot read .* as (a|whole|yes|names)"):
+        parse(name, object())
 
 
 def test_every_field_has_a_group_and_ten_or_so_come_first() -> None:

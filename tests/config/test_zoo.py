@@ -42,7 +42,7 @@ PICKED = [
     ("MiniGrid-DoorKey-5x5-v0", "minigrid", 100_000, {"rollout_steps": 128}),
     ("MiniGrid-FourRooms-v0", "minigrid-long", 5_000_000, {"rollout_steps": 512}),
     ("PointMaze_UMazeDense-v3", "robotics", 1_000_000, {}),
-    ("gymnasium_robotics:FetchReachDense-v4", "robotics", 1_000_000, {}),
+    ("gymnasium_robotics:FetchReachDense-v4", "robotics", 200_000, {}),
 ]
 
 

@@ -39,6 +39,9 @@ def test_each_state_is_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[
     rows = [row("ppo", 0, 100, return_mean=5.0), row("ppo", 1, 200, return_mean=7.0)]
     make_run(tmp_path / "done", {}, [*rows, row("ppo", 0, 300, return_mean=1.0)], complete=True)
     make_run(tmp_path / "study" / "units" / "x" / "run", {}, rows, complete=False)
+    stopped = make_run(tmp_path / "stopped", {}, rows)
+    members = {"ppo/0": {"stopped_early": "return"}, "ppo/1": {}}
+    (stopped / "summary.json").write_text(json.dumps({"complete": True, "members": members}))
     failed = make_run(tmp_path / "failed", {"arm": ["ppo", "sauna"]}, [*rows, row("sauna", 0, 50)])
     (failed / "failure.txt").write_text("Traceback")
     resumed = make_run(tmp_path / "resumed", {"budget": "kept"}, rows)
@@ -56,6 +59,7 @@ def test_each_state_is_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert shown[1:] == ["ppo", "2", "0 of 1,000", "running"]
     assert found == {
         "done": ["Hopper-v5", "ppo", "2", "250 of 1,000", "finished", "4.00"],
+        "stopped": ["Hopper-v5", "ppo", "2", "150 of 1,000", "finished (1 stopped early)", "6.00"],
         "study/units/x/run": ["Hopper-v5", "ppo", "2", "150 of 1,000", "interrupted", "6.00"],
         "failed": ["Hopper-v5", "ppo, sauna", "2", "88 of 1,000", "failed", "ppo 6.00"],
         "resumed": ["Hopper-v5", "ppo", "2", "75 of 1,000", "interrupted", "6.00"],

@@ -11,6 +11,7 @@ import pytest
 
 import sauna
 from faults.canned import ENV, SAVED, SETTINGS, Ended, go, played_back, record
+from sauna.experiments.run_list import examine
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.training.summary import STOPS
@@ -47,6 +48,8 @@ def test_an_exception_of_a_callback_is_its_own_and_the_run_goes_on_later(tmp_pat
         assert "fail" in [frame.name for frame in caught.traceback]
         (note,) = caught.value.__notes__
         assert "iteration 3 of ppo/0" in note and f"sauna resume {run}" in note
+        assert (run / "failure.txt").read_text().rstrip().endswith("OfUser: a typo")
+        assert examine(run).state == "failed"
         go(run)
         go(whole)
     assert Ended(whole).differs(run) is None
@@ -79,6 +82,16 @@ def test_a_stop_is_in_the_checkpoint_at_the_end_of_the_same_iteration(tmp_path: 
         result = sauna.resume(run, quiet=True)
     assert (run / "metrics.jsonl").read_bytes() == metrics and whole.differs(run) is None
     assert result.summary["ppo/0"]["stopped_early"] == "callback"
+
+
+@pytest.mark.parametrize(
+    "callback, words",
+    [(3, "must be a function of a row, not int"), (lambda: True, "cannot be called with a row")],
+)
+def test_what_cannot_be_called_with_a_row_is_refused(callback: Any, words: str, tmp_path) -> None:
+    with pytest.raises(BadInput, match=f"callback: {words}") as error:
+        sauna.train(ENV, out=tmp_path / "run", quiet=True, callback=callback, **SETTINGS)
+    assert "\n" not in str(error.value) and list(tmp_path.iterdir()) == []
 
 
 def test_callbacks_do_not_run_on_several_machines(tmp_path: Path) -> None:

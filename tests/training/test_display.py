@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -9,13 +10,14 @@ from typing import Any
 
 import pytest
 
-from sauna.config.presets import resolve_run
+from sauna.config.presets import resolve, resolve_run
 from sauna.training import display
 from sauna.training.display import (
     NotebookDisplay,
     PlainDisplay,
     columns_of,
     counted,
+    headline,
     make_display,
     returns,
 )
@@ -76,6 +78,13 @@ def test_many_members_are_summed_up_by_arm() -> None:
     assert returns(latest) == "mean return: ppo 1.0, sauna+random -"
     few = dict(list(latest.items())[:3])
     assert returns(few) == "return: ppo/0 0.0, ppo/1 2.0, ppo/2 -"
+
+
+def test_a_part_that_was_passed_by_value_trains_in_this_process() -> None:
+    config = resolve({"env": "none", "processes": 2})
+    assert "2 processes; writing" in headline(config, [], Path("run"))
+    config = dataclasses.replace(config, env="sauna.config.local:f_0")
+    assert "this process; writing" in headline(config, [], Path("run"))
 
 
 def test_one_is_singular() -> None:

@@ -44,7 +44,7 @@ def _stop_at(limit: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     try:
         number = float(limit)
     except (ValueError, TypeError):
-        raise BadInput(f"target_kl: cannot read {limit!r} as float") from None
+        raise BadInput(f"target_kl: cannot read {limit!r} as a number") from None
     if not 0 < number < float("inf"):
         raise BadInput(f"target_kl: must be a number above 0, not {limit}")
     kwargs = json.loads(parse("stop_kwargs", given.get("stop_kwargs") or "{}"))

@@ -85,6 +85,7 @@ def check_consistent(config: Config) -> None:
         )
     if config.steps < batch:
         raise BadInput(f"steps: {config.steps} is less than one rollout of {batch} steps")
+    _check_evaluations(config, batch)
     if config.schedule_start >= config.steps:
         raise BadInput(f"schedule_start: {config.schedule_start} is not below steps {config.steps}")
     if config.distributed and config.init_from:
@@ -118,6 +119,19 @@ def check_consistent(config: Config) -> None:
         import_name(name, getattr(config, name))
     for path in config.wrap:
         check_wrapper(path)
+
+
+def _check_evaluations(config: Config, batch: int) -> None:
+    """Refuses evaluations that would never come.
+
+    Raises:
+      BadInput: naming the last env step of the run.
+    """
+    last = config.steps // batch * batch
+    if config.eval_every > last and config.filter == "none":
+        raise BadInput(
+            f"eval_every: the run ends after {last:,} env steps, before the first evaluation"
+        )
 
 
 def check_wrapper(path: str) -> None:

@@ -36,6 +36,7 @@ def flag(name: str) -> str:
 _KINDS: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
+    float | None: "a number",
     bool: "yes or no",
     str: "text",
     tuple[int, ...]: "whole numbers, separated by commas",
@@ -76,7 +77,7 @@ def _expected(name: str, value: Any) -> str:
     schedule = FIELDS.get(f"{name}_schedule")
     if schedule is None:
         return f"{kind}; it does not change over the training"
-    choices = ", ".join(schedule.metadata["choices"])
+    choices = ", ".join((*schedule.metadata["choices"], "your function"))
     return f"{kind}; over the training {schedule.name} changes it ({choices})"
 
 

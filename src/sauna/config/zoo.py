@@ -66,7 +66,8 @@ ZOO = (
     Entry(r"MiniGrid-KeyCorridor.+", "minigrid", 500_000, RL_ZOO),
     Entry(r"MiniGrid-(?:Fetch|GoToDoor)-.+", "minigrid", 5_000_000, RL_ZOO),
     Entry(r"MiniGrid-.+", "minigrid", 10_000_000, RL_ZOO),
-    Entry(r"PointMaze_\w*Dense-v\d+|FetchReachDense-v\d+", "robotics", 1_000_000, OWN),
+    Entry(r"PointMaze_\w*Dense-v\d+", "robotics", 1_000_000, OWN),
+    Entry(r"FetchReachDense-v\d+", "robotics", 200_000, OWN),
 )
 
 

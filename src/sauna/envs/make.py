@@ -15,7 +15,12 @@ from sauna.config.settings import NATIVE
 from sauna.envs.host.answers import close
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
-from sauna.envs.host.packages import as_vector, package_of, register
+from sauna.envs.host.packages import (
+    as_vector,
+    know_joints_of_mujoco_4,
+    package_of,
+    register,
+)
 from sauna.envs.host.together import group_size, is_known, maker_of, plain_maker, rows_of
 from sauna.envs.spaces import stretch
 from sauna.envs.wrapping import PLAIN, Wrapping, wrapped
@@ -136,8 +141,11 @@ def _registered(env: str) -> str:
         hint = _with_colon(env) or nearest(name, gymnasium.registry)
         raise BadInput(f"env: unknown environment {env!r}{hint}")
     entry = str(gymnasium.registry[name].entry_point)
-    if "mujoco" in entry or entry.startswith("gymnasium_robotics"):
+    of_robotics = entry.startswith("gymnasium_robotics")
+    if "mujoco" in entry or of_robotics:
         tame_mujoco()
+    if of_robotics:
+        know_joints_of_mujoco_4()
     return name
 
 

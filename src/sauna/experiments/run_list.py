@@ -143,11 +143,19 @@ def _returns(labels: Mapping[str, str], last: Mapping[str, Mapping[str, Any]]) -
 
 def _state(run: Path) -> str:
     if run_directory.is_complete(run):
-        return "finished"
+        return _finished(run)
     if _is_locked(run / ".lock"):
         return "running"
     failed = _time_of(run / "failure.txt")
     return "failed" if failed and failed >= _time_of(run / "metrics.jsonl") else "interrupted"
+
+
+def _finished(run: Path) -> str:
+    """`finished`, and how many members did not use their budget because they were stopped."""
+    members = run_directory.read_config_file(run / "summary.json").get("members")
+    rows = members.values() if isinstance(members, dict) else ()
+    stopped = sum(isinstance(row, dict) and bool(row.get("stopped_early")) for row in rows)
+    return f"finished ({stopped} stopped early)" if stopped else "finished"
 
 
 def _is_locked(path: Path) -> bool:

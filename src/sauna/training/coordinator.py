@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import signal
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from functools import partial
 from multiprocessing.connection import wait
@@ -346,6 +347,7 @@ class Coordinator:
             try:
                 stops = callback(copy.deepcopy(row))
             except Exception as error:
+                replace_file(self._run.path / "failure.txt", traceback.format_exc().encode())
                 error.add_note(
                     f"raised by the callback, at iteration {row['iteration']} of {row['member']}; "
                     f"continue from the last checkpoint with: {resume_command(self._run.path)}"

@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Protocol
 
+from sauna.config.checks import local_parts
 from sauna.config.presets import Member
 from sauna.config.settings import Config
 from sauna.training.summary import WINDOW, with_evaluation
@@ -366,10 +367,11 @@ def columns_of(members: list[Member], succeeds: bool = False) -> list[tuple[str,
 
 def headline(config: Config, members: list[Member], path: Path) -> str:
     """Says in one line what is trained, and where it is written."""
+    place = f"{config.processes} process{'es' if config.processes > 1 else ''}"
     arms = ", ".join(dict.fromkeys(member.arm for member in members))
     return (
         f"{config.env}: {counted(len(members), 'member')} "
         f"({arms} x {counted(len(config.seeds), 'seed')}), {config.steps:,} "
         f"{'env' if config.budget == 'env' else 'kept'} steps each, preset {config.preset}, "
-        f"{config.processes} process{'es' if config.processes > 1 else ''}; writing to {path}"
+        f"{'this process' if local_parts(config) else place}; writing to {path}"
     )

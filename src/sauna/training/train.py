@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -51,6 +52,7 @@ def train_run(
     try:
         if inexact and run.config.backend == "device":
             raise BadInput("inexact: a run on the device brings its environments back exactly")
+        _check_callback(callback)
         if callback is not None and run.config.distributed:
             raise BadInput("callback: not called with distributed")
         with disk_errors(run.path):
@@ -61,6 +63,24 @@ def train_run(
         raise
     finally:
         run.lock.close()
+
+
+def _check_callback(callback: Any) -> None:
+    """Refuses what cannot be called with a row.
+
+    Raises:
+      BadInput: saying what it must be.
+    """
+    if callback is None:
+        return
+    if not callable(callback):
+        raise BadInput(f"callback: must be a function of a row, not {type(callback).__name__}")
+    try:
+        inspect.signature(callback).bind({})
+    except TypeError as error:
+        raise BadInput(f"callback: cannot be called with a row: {error}") from None
+    except ValueError:  # a function of C, which does not say what it takes
+        pass
 
 
 def _train(

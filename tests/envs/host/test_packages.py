@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 
 import gymnasium
+import numpy as np
 import pytest
 
 from sauna.envs.host import packages
@@ -53,6 +54,19 @@ def test_the_dense_maze_is_read_as_one_vector() -> None:
     found = probe("PointMaze_UMazeDense-v3", {})
     assert found.spaces.observation_shape == (2 + 2 + 4,)
     assert found.spaces.action_kind == "continuous" and found.time_limit == 300
+
+
+@pytest.mark.parametrize("module", ["", "gymnasium_robotics:"])
+def test_fetch_can_be_made_and_shows_its_joints(module: str) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    env = make_env(f"{module}FetchReachDense-v4", {})
+    env.reset(seed=0)
+    finger = env.unwrapped.data.joint("robot0:l_gripper_finger_joint").qpos[0]
+    seen = env.step(np.zeros(4, np.float32))[0]["observation"]
+    assert seen.shape == (10,) and 0 <= abs(finger) < 0.1
+    joint = env.unwrapped.data.joint("robot0:r_gripper_finger_joint").qpos[0]
+    assert seen[3] == joint  # the gripper's first number
+    env.close()
 
 
 def test_other_environments_stay_as_they_are() -> None:

@@ -235,6 +235,14 @@ def test_what_only_evaluations_read_is_refused_without_them(name: str, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_evaluations_that_would_never_come_are_refused(tmp_path: Path) -> None:
+    last = r"eval_every: the run ends after 64 env steps, before the first evaluation"
+    settings = {**SMALL, "steps": 64 + 31, "eval_every": 65, "out": tmp_path / "run"}
+    with pytest.raises(BadInput, match=last):
+        sauna.train("small_envs:Scripted", **settings)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_episode_says_whether_it_was_a_success() -> None:
     """`Informative` calls an even length one; of an episode that was cut nothing is known."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import re
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 from sauna.system.errors import BadInput
@@ -46,6 +47,21 @@ def register(package: Package, name: str) -> None:
     if importlib.util.find_spec(package.module) is None:
         raise BadInput(f"env: {name} needs `pip install 'sauna-rl[{package.extra}]'`")
     gymnasium.register_envs(importlib.import_module(package.module))
+
+
+def know_joints_of_mujoco_4() -> None:
+    """Lets Gymnasium-Robotics (1.4.2) find its joints with MuJoCo 4.
+
+    It asks whether a number is in a tuple of MuJoCo's kinds of joints. Since MuJoCo 4 those equal
+    no NumPy number there, and Fetch, Hand and Kitchen fail. Here the kinds become plain numbers.
+    """
+    import mujoco
+
+    utils = importlib.import_module("gymnasium_robotics.utils.mujoco_utils")
+    kinds = {name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()}
+    seen = ModuleType(mujoco.__name__)
+    seen.__dict__.update(mujoco.__dict__, mjtJoint=SimpleNamespace(**kinds))
+    vars(utils)["mujoco"] = seen
 
 
 def as_vector(env: Any) -> Any:

@@ -152,7 +152,7 @@ def _draw_arm(
 ) -> None:
     """Draws every seed and, over the env steps that all of them have, their mean."""
     for x, y in members.values():
-        style.draw_seed(axes, look, x, y)
+        style.draw_seed(axes, look, x, y, look.dash)
     first = max(x[0] for x, _ in members.values())
     last = max(first, min(x[-1] for x, _ in members.values()))
     grid = np.linspace(first, last, GRID)

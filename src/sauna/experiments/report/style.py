@@ -133,7 +133,7 @@ def draw_line(
         x,
         y,
         color=look.colour,
-        linestyle=(0, look.dash) if look.dash else "-",
+        linestyle=_dashes(look.dash),
         linewidth=1.8,
         marker=look.marker,
         markersize=4,
@@ -144,9 +144,13 @@ def draw_line(
     return line
 
 
-def draw_seed(axes: Any, look: Look, x: Any, y: Any) -> None:
+def draw_seed(axes: Any, look: Look, x: Any, y: Any, dash: tuple[float, ...] = ()) -> None:
     """Draws a thin line for one seed."""
-    axes.plot(x, y, color=look.colour, alpha=0.45, linewidth=0.8)
+    axes.plot(x, y, color=look.colour, alpha=0.45, linewidth=0.8, linestyle=_dashes(dash))
+
+
+def _dashes(dash: tuple[float, ...]) -> Any:
+    return (0, dash) if dash else "-"
 
 
 def count_steps(axes: Any) -> None:
