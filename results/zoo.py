@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from sauna.config.presets import PRESETS
-from sauna.config.zoo import ENVS, Entry, entry_of
+from sauna.config.zoo import ENVS, OWN, Entry, entry_of
 from sauna.experiments.report.curve import member_curves
 from sauna.experiments.study.units import digest_of
 from sauna.system import run_directory
@@ -77,6 +77,11 @@ TRAINED = (  # cheapest first
     "BipedalWalker-v3",
     "CarRacing-v3",
 )
+BY_SPACES = {  # environments that the zoo does not know, for the presets that it picks for such
+    "FrozenLake-v1": ("discrete", 200_000),
+    "zoo_envs:long_swimmer": ("long-horizon", 1_000_000),
+    "zoo_envs:Catch": ("pictures", 500_000),
+}
 SHORTER = {"CarRacing-v3": 100_000}  # env steps, where those of `sauna train` take days
 # Why an environment is not among them, by a pattern of its whole name. `--only` trains it, too.
 LEFT_OUT = {
@@ -89,13 +94,15 @@ LEFT_OUT = {
 
 def plan_of(env: str) -> str:
     """Says whether an environment waits for its turn, or why it is left out."""
-    if env in TRAINED:
+    if env in (*TRAINED, *BY_SPACES):
         return "waits for its turn"
     return next(why for pattern, why in LEFT_OUT.items() if re.fullmatch(pattern, env))
 
 
 def planned(env: str) -> Entry:
     """What the zoo knows of an environment, with the env steps that it is trained for here."""
+    if env in BY_SPACES:
+        return Entry(env, *BY_SPACES[env], OWN)
     entry = entry_of(env)
     assert entry is not None
     return entry._replace(steps=SHORTER.get(env, entry.steps))
@@ -126,7 +133,8 @@ def store(units: dict[str, Any]) -> None:
 
 def sauna(*arguments: str) -> int:
     """Runs a command of the package under test; returns its exit code."""
-    path = os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
+    places = [str(ROOT / "src"), str(ROOT / "results"), os.environ.get("PYTHONPATH", "")]
+    path = os.pathsep.join(places)
     command = [sys.executable, "-m", "sauna", *arguments]
     return subprocess.run(command, env={**os.environ, "PYTHONPATH": path}).returncode
 
@@ -200,18 +208,18 @@ def _thinned(steps: np.ndarray, returns: np.ndarray) -> dict[str, list[float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--only", nargs="+", choices=ENVS, metavar="ENV", default=[])
+    parser.add_argument("--only", nargs="+", choices=(*BY_SPACES, *ENVS), metavar="ENV", default=[])
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
     RUNS.mkdir(parents=True, exist_ok=True)
-    for env in arguments.only or TRAINED:
+    for env in arguments.only or (*BY_SPACES, *TRAINED):
         entry = planned(env)
         if arguments.list:
             print(f"{env:33} {entry.preset:24} {entry.steps:>11,} {'done' * is_done(env, entry)}")
             continue
         if is_done(env, entry):
             continue
-        run = RUNS / f"{env.replace('/', '-')}_{digest_of(settings_of(entry))}"
+        run = RUNS / f"{re.sub('[/:]', '-', env)}_{digest_of(settings_of(entry))}"
         if not run_directory.is_complete(run) and not train(env, entry, run):
             print(f"{env}: failed; the next one", flush=True)
             continue

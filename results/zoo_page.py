@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from studies import listed, load, markdown, page
-from zoo import SHORTER, TRAINED, plan_of, planned
+from zoo import BY_SPACES, SHORTER, TRAINED, plan_of, planned
 
 from sauna.config.zoo import ENVS, PUBLISHED, entry_of, shown_published
 from sauna.experiments.report import style
@@ -21,7 +21,8 @@ SAMPLED = (
 )
 # Why a return is below the published one by more than the published spread.
 WORDS = {
-    "HalfCheetah-v5": "preset `mujoco` is one for all tasks; RL Zoo has tuned numbers.",
+    "Ant-v5": "`Ant-v5` shows contact forces and charges for them. Gymnasium's page says that in "
+    "`Ant-v3` they may have been 0.",
     "MiniGrid-DoorKey-5x5-v0": f"{SAMPLED} With the most likely actions, one seed does not reach "
     "the goal in 2 of its 20 episodes.",
     "MiniGrid-Unlock-v0": f"{SAMPLED} With the most likely actions, one seed does not reach the "
@@ -32,8 +33,9 @@ WORDS = {
 
 def zoo_page(units: Mapping[str, Any]) -> str:
     """The page, from the units of `results/zoo.json`."""
-    done = [env for env in ENVS if env in units]
-    missing = [env for env in ENVS if env not in units]
+    envs = (*ENVS, *BY_SPACES)
+    done = [env for env in envs if env in units]
+    missing = [env for env in envs if env not in units]
     below = [f"`{env}`: {_word(env, units[env])}" for env in done if is_below(env, units[env])]
     figure = "![Training curves of three seeds each](figures/zoo.svg)\n\n" + CAPTION
     return page(
@@ -44,6 +46,7 @@ def zoo_page(units: Mapping[str, Any]) -> str:
         seconds=_seconds(),
         shorter=" ".join(map(_shorter, SHORTER)),
         planned=f"{len(TRAINED)} of the {len(ENVS)} environments",
+        by_spaces=", ".join(f"`{env}`" for env in BY_SPACES),
         missing=markdown(
             [["Environment", "Preset", "Env steps", "RL Zoo", "Why"], *map(_missing, missing)]
         ),
@@ -132,7 +135,7 @@ def draw_zoo(units: Mapping[str, Any], path: Path) -> Path:
     """Draws the training curves of every unit, with RL Zoo's return as a line and a band."""
     from matplotlib.figure import Figure
 
-    done = [env for env in ENVS if env in units]
+    done = [env for env in (*ENVS, *BY_SPACES) if env in units]
     rows = -(-len(done) // COLUMNS)
     look = style.looks({"ppo": "ppo"})["ppo"]
     with style.applied():

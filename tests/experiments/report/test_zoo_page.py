@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from zoo import LEFT_OUT, TRAINED, is_done, plan_of, settings_of, stored
+import pytest
+from zoo import BY_SPACES, LEFT_OUT, TRAINED, is_done, plan_of, settings_of, stored
 from zoo_page import WORDS, draw_zoo, is_below, zoo_page
 
 from sauna.config.zoo import ENVS, PUBLISHED, entry_of
+from sauna.training.pick import pick
 
 
 def unit(*returns: float) -> dict[str, Any]:
@@ -57,6 +59,11 @@ def test_each_environment_waits_for_its_turn_or_is_left_out_for_a_reason() -> No
     assert {plan_of(env) for env in TRAINED} == {"waits for its turn"}
     presets = {entry.preset for env in TRAINED if (entry := entry_of(env))}
     assert "minigrid-long" in presets
+
+
+@pytest.mark.parametrize("env", BY_SPACES)
+def test_an_environment_that_the_zoo_does_not_know_gets_a_preset_by_its_spaces(env: str) -> None:
+    assert entry_of(env) is None and pick({"env": env}).overrides["preset"] == BY_SPACES[env][0]
 
 
 def test_a_figure_has_a_panel_for_each_environment(tmp_path: Path) -> None:
