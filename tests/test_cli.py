@@ -94,7 +94,7 @@ BAD = [
     (["train", ENV, "--target-kl", "0"], "target_kl: must be a number above 0"),
     (["train", ENV, "--target-kl", "x"], "target_kl: cannot read 'x' as a number"),
     (["train", ENV, "--target-kl", "0.01", "--stop", "espo"], "either target_kl or stop"),
-    (["train", ENV, "--target-kl", "0.01", "--algorithm", "a2c"], "stop: not read"),
+    (["train", ENV, "--target-kl", "0.01", "--algorithm", "a2c"], "target_kl: only read"),
     (["train", ENV, "--eval-every", "512", "--stop-at", "x"], "stop_at: cannot read 'x' as a num"),
     (["train", ENV, "--optimizer", "adamv"], "did you mean 'adam'"),
     (["train", ENV, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),

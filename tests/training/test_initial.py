@@ -137,9 +137,13 @@ def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> No
     for more, message in (
         ({"hidden": "8,9"}, "hidden is 8,8 in .*, and 8,9 here"),
         ({"activation": "relu"}, "activation is tanh in .*, and relu here"),
-        ({"trunk": "shared"}, "trunk is separate in .*, and shared here"),
+        (
+            {"trunk": "shared"},
+            "trunk is separate in .*, and shared here; that run has preset mujoco",
+        ),
         ({"normalize_observations": False}, "normalize_observations is True in .*, and False"),
         ({"init_from": str(tmp_path)}, "is no run, and no RUN/ARM/SEED of one"),
+        ({"init_from": str(run.parent)}, f"one; did you mean {run}\\?"),
         ({"init_from": f"{run}/ppo/7"}, "member: unknown member 'ppo/7'"),
     ):
         settings = {**SETTINGS, "init_from": str(run), **more}

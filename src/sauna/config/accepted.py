@@ -41,6 +41,8 @@ def translate(values: Mapping[str, Any]) -> dict[str, Any]:
 def _stop_at(limit: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     if given.get("stop") not in (None, "target-kl"):
         raise BadInput("target_kl: give either target_kl or stop, not both")
+    if given.get("algorithm") not in (None, "ppo"):
+        raise BadInput("target_kl: only read with algorithm ppo")
     try:
         number = float(limit)
     except (ValueError, TypeError):

@@ -81,7 +81,7 @@ def _seeds_name(seeds: tuple[int, ...]) -> str:
     return f"{len(seeds)}seeds"
 
 
-def _run_below(folder: Path) -> str:
+def run_below(folder: Path) -> str:
     """Where the runs of a unit, or of a comparison, are; empty if there are none."""
     if (folder / "run" / "config.json").is_file():
         return f"; did you mean {folder / 'run'}?"
@@ -203,7 +203,7 @@ def read_config(
                 f"{run} is an exported policy, and no run: it can be played (sauna eval) and "
                 f"trained further (--init-from)"
             )
-        raise BadInput(f"{run} is not a run directory (it has no config.json){_run_below(run)}")
+        raise BadInput(f"{run} is not a run directory (it has no config.json){run_below(run)}")
     stored = _read(path)
     for name, kind in _PARTS.items():
         missing = None if name in needed else kind()

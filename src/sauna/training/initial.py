@@ -18,7 +18,7 @@ from sauna.config.settings import Config
 from sauna.envs.spaces import difference
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
-from sauna.system.run_directory import INITIAL, is_exported
+from sauna.system.run_directory import INITIAL, is_exported, run_below
 from sauna.training.artifact import Artifact, find_member, load_artifact, policy_arrays
 from sauna.training.cloning import clone_members, is_data
 from sauna.training.located import HUB, ZOO, locate
@@ -79,7 +79,10 @@ def read_initial(
         return clone_members(prepared, say)
     source = Source(config.init_from)
     if not _is_run(source.run):
-        raise BadInput(f"init_from: {config.init_from} is no run, and no RUN/ARM/SEED of one")
+        below = run_below(source.run)
+        raise BadInput(
+            f"init_from: {config.init_from} is no run, and no RUN/ARM/SEED of one{below}"
+        )
     artifact = load_artifact(source.run, say, trust=trust)
     check_fits(artifact, prepared)
     arrays: dict[str, np.ndarray] = {}
@@ -112,7 +115,8 @@ def check_fits(artifact: Artifact, prepared: Prepared) -> None:
         before, now = getattr(theirs, field), getattr(ours, field)
         if before != now and _matters(field, ours):
             raise BadInput(
-                f"init_from: {field} is {_text(before)} in {name}, and {_text(now)} here"
+                f"init_from: {field} is {_text(before)} in {name}, and {_text(now)} here; that run "
+                f"has preset {theirs.preset}"
             )
 
 

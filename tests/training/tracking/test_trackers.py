@@ -178,6 +178,7 @@ def test_a_tracker_that_fails_at_the_end_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "track, message",
     [
+        ("none,tensorboard", "track: none stands alone"),
         ("wndb", "unknown tracker 'wndb' .*did you mean 'wandb'"),
         ("no_such_module:T", "track: cannot import 'no_such_module'"),
         (f"{__name__}:row", "is no subclass of sauna.Tracker"),

@@ -39,6 +39,8 @@ def check_trackers(config: Config) -> None:
     Raises:
       BadInput: with the known ones, or the extra to install.
     """
+    if "none" in config.track and chosen(config):
+        raise BadInput("track: none stands alone")
     for name in chosen(config):
         if ":" in name:
             _class_of(name)
