@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from sauna import __version__
-from sauna.config.accepted import translate
+from sauna.config.accepted import over, translate
 from sauna.config.choices import LISTS, PEERS
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint, spread_hint
@@ -265,7 +265,7 @@ def _train(values: dict[str, Any]) -> None:
     trust = values.pop("trust")
     file, env = values.pop("config"), values.pop("env")
     stored = _overrides_in(file, trust)
-    picked = pick(_over(stored, values | ({"env": env} if env else {})))
+    picked = pick(over(stored, values | ({"env": env} if env else {})))
     overrides = translate(picked.overrides)
     display = make_display()
     if runs.follows(overrides):
@@ -281,14 +281,6 @@ def _train(values: dict[str, Any]) -> None:
 def _print_curve(run: Path) -> None:
     curve = run / "figures" / "learning_curve.png"
     print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
-
-
-def _over(stored: dict[str, Any], typed: dict[str, Any]) -> dict[str, Any]:
-    """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
-    replaced = {"seed": "seeds", "batch_size": "minibatches", "target_kl": "stop"}
-    gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
-    gone += ["stop_kwargs"] * ("stop" in gone)
-    return {k: v for k, v in stored.items() if k not in gone} | typed
 
 
 def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:

@@ -38,6 +38,14 @@ def translate(values: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+def over(stored: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
+    replaced = {"seed": "seeds", "batch_size": "minibatches", "target_kl": "stop"}
+    gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
+    gone += ["stop_kwargs"] * ("stop" in gone)
+    return {k: v for k, v in stored.items() if k not in gone} | dict(typed)
+
+
 def _stop_at(limit: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     if given.get("stop") not in (None, "target-kl"):
         raise BadInput("target_kl: give either target_kl or stop, not both")
