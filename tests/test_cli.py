@@ -10,7 +10,7 @@ import pytest
 
 from command_line import sauna, sauna_here, small_flags
 from sauna import cli
-from sauna.config.accepted import translate
+from sauna.config.accepted import over, translate
 from sauna.config.other_names import ACCEPTED, ADVICE, SAME
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import ARMS, PRESETS, overrides_of, resolve, resolve_run
@@ -283,7 +283,7 @@ def test_seed_and_batch_size_replace_what_a_file_says(tmp_path) -> None:
     file = tmp_path / "settings.json"
     file.write_text(json.dumps({"env": ENV, "seeds": [1, 2], "minibatches": 4}))
     typed = {"seed": "7", "batch_size": "256"}
-    merged = translate(cli._over(cli._overrides_in(str(file), trust=True), typed))
+    merged = translate(over(cli._overrides_in(str(file), trust=True), typed))
     assert merged == {"env": ENV, "seeds": (7,), "minibatches": 8}
 
 
