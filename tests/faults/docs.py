@@ -7,6 +7,24 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+# What the worst time of each row is the time of, as the docstring of the row's experiment says.
+TIMED = {
+    1: "a load",
+    2: "from a resume's start to its first new row",
+    3: "a load",
+    4: "CPU, a refusal",
+    5: "a refusal",
+    6: "from the bad number to the error",
+    7: "an update",
+    8: "from the fault to the error; a hang: beyond its deadline",
+    9: "from the first signal to the process's end",
+    10: "from the failing operation to the command's end",
+    11: "until the losers have ended",
+    12: "CPU, an answer",
+    13: "the study's last part, not interrupted",
+    14: "a resume",
+    15: "CPU, a refusal",
+}
 
 
 def write(page: Path, stored: dict[str, Any]) -> None:
@@ -30,7 +48,7 @@ def _campaign(stored: dict[str, Any]) -> list[str]:
         notes = ", ".join(f"{name} {value:,}" for name, value in row["notes"].items())
         lines.append(
             f"| {int(number)} {row['row']} | {row['tried']:,} | {row['lost']} | "
-            f"{row['silent']} | {row['worst']:.3g} s | {notes} |"
+            f"{row['silent']} | {row['worst']:.3g} s: {TIMED[int(number)]} | {notes} |"
         )
     machines = {
         f"{row['machine']['processor']}, {row['machine']['cores']} cores"
