@@ -113,7 +113,7 @@ class Count(NamedTuple):
     better: int
     worse: int
     tasks: int
-    unfiltered: bool  # the arm filters, and drops next to nothing on every task
+    unfiltered: bool  # the arm filters, and drops at most 1% of its steps on every task
 
 
 def count(results: Mapping[str, Any], claim: int, label: str) -> Count | None:
@@ -148,7 +148,7 @@ def short_answer(counts: Mapping[str, Count]) -> str:
     word, colon, rest = answer.partition(":")
     answer = f"**{word}**{colon}{rest}"
     if all(count.unfiltered for count in counts.values()):
-        answer += "; it drops next to nothing"
+        answer += "; it drops at most 1% of its steps"
     return answer
 
 
@@ -230,9 +230,9 @@ def _judged(
     if others:
         so += _over(over)
     if len(inactive) == len(found):
-        so += "; it drops next to nothing"
+        so += "; it drops at most 1% of its steps"
     elif won := [task for task in better if task in inactive]:
-        so += f"; it drops next to nothing on {', '.join(won)}"
+        so += f"; it drops at most 1% of its steps on {', '.join(won)}"
     low, high = f"{min(keep_rates):.3f}", f"{max(keep_rates):.3f}"
     kept = low if low == high else f"{low} to {high}"
     return [str(len(pairs)), interval(over, 2), kept, so]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from studies import TITLES, WHY, former_controls, markdown, page, shown_label
+from studies import TITLES, WHY, command_of, former_controls, markdown, page, shown_label
 
 from sauna.experiments.measure import coverage_report, noise_report, posture_report
 from sauna.experiments.statistics import ALPHA, holm
@@ -74,16 +74,17 @@ def _kind(text: str, equal: float, words: tuple[str, str]) -> str:
 
 
 def noise_answer(measured: Mapping[str, Any]) -> str:
+    """Answers in a word only if all cases agree; else it says what each case decides."""
     kinds = [_noise_kinds(row) for row in noise_report.text_table(measured)[1:]]
     answers = []
     for place, name in ((0, "by variance"), (1, "by signal to noise")):
         found = [kind[place] for kind in kinds]
-        counts = [(found.count(word), word) for word in ("noisier", "less noisy")]
-        said = ", ".join(f"{word} in {n} of {len(found)} cases" for n, word in counts if n)
-        yes, no = counts[0][0], counts[1][0]
-        word = "yes" if yes and not no else "no" if no and not yes else "mixed" if yes else ""
-        answers.append(f"**{word or 'not decided'}** {name}" + (f" ({said})" if said else ""))
-    return ", ".join(answers)
+        counts = [(word, found.count(word)) for word in ("noisier", "less noisy", "not decided")]
+        said = ", ".join(f"{word} in {n} of {len(found)}" for word, n in counts if n)
+        answer = {"noisier": "**yes**", "less noisy": "**no**"}.get(found[0], "**not decided**")
+        agree = len(set(found)) == 1
+        answers.append(f"{answer} {name} ({said} cases)" if agree else f"{name} {said} cases")
+    return "; ".join(answers)
 
 
 def sweep_page(measured: Mapping[str, Any]) -> str:
@@ -111,12 +112,12 @@ def sweep_page(measured: Mapping[str, Any]) -> str:
     ]
     return page(
         "threshold_sweep",
-        command=measured["command"],
+        command=command_of("dial"),
         title=TITLES["dial"],
         why=WHY["dial"],
         correlations=markdown(correlations),
         controls=markdown(controls),
-        former=former_controls(measured["cells"]),
+        former=former_controls(measured["cells"], ["dial"]),
         arms=markdown([head, *arms]),
     )
 

@@ -56,8 +56,8 @@ def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
     controls = [row for row in rows if row[0].endswith(f"{RANDOM_CONTROL}`")]
     parts = [
         "## The screen: rule by task",
-        "Five seeds. First the word at equal env steps and the probability of improvement over "
-        "`ppo`, then the learner compute that it takes to reach PPO's final return.",
+        "Five seeds. A cell shows the word at equal env steps and the probability of improvement "
+        "over `ppo`, then the learner compute that the arm takes to reach PPO's final return.",
         markdown([head, *rules]),
         folded("The matched random controls", markdown([head, *controls])),
         *(_task(task, r, s) for r, s in summaries for task in s["curves"]),
@@ -111,16 +111,11 @@ def screen_answer() -> str | None:
     whole = [task for task in tasks if all(task in found for found in words.values())]
     better = [f"`{label}`" for label, found in words.items() if "better" in found.values()]
     worse = [label for label, found in words.items() if "worse" in found.values()]
-    part = f", in part on {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""
-    gains = (
-        f"better than `ppo` by their intervals: {', '.join(better)}"
-        if better
-        else ("no rule is better than `ppo` by its interval")
-    )
-    losses = f"worse on at least one: {len(worse)} of {len(words)} rules"
+    part = f" and a part of {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""
+    gains = f"better on a task: {', '.join(better)}" if better else "no rule beats `ppo`"
     return (
-        f"**not decided**: screened with 5 seeds on {len(whole)} of {len(planned)} tasks{part}; "
-        f"{gains}; {losses}"
+        f"**not decided** after 5 seeds on {len(whole)} of {len(planned)} tasks{part}. By the "
+        f"intervals {gains}, and {len(worse)} of {len(words)} scored worse on a task"
     )
 
 
@@ -173,7 +168,7 @@ def _task(task: str, results: Mapping[str, Any], summary: Mapping[str, Any]) -> 
     text = [f"`{results['command']}`, preset `{_preset(results, task)}`.", arms(task, summary)]
     beside = [v["text"] for v in summary["filtering"] if v["task"] == task]
     if beside:
-        text += ["Rules beside their matched random controls:"]
+        text += ["Rules against their matched random controls:"]
         text += ["\n".join(f"- {sentence}" for sentence in beside)]
     return f"### {_short(task)}\n\n{folded('All arms', chr(10).join(_spaced(text)))}"
 

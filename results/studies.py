@@ -9,7 +9,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from sauna.config.presets import RANDOM_CONTROL
 from sauna.experiments.measure import coverage_report, noise_report, posture_report
+from sauna.experiments.study.spec import FORMER_STUDIES, load_spec
 
 ROOT = Path(__file__).parent.parent
 STUDIES = (
@@ -65,7 +67,7 @@ WHY = {
     "512 steps, else the preset, whose numbers are RL Zoo's. `gsde` keeps its noise for 4 steps.",
     "memory": "A cue has to be recalled nine env steps later, and a pendulum swings up whose "
     "velocity is not observed. `mlp` has no memory; `lstm` and `gru` have a cell of width 64 "
-    "behind each trunk and learn from sequences of 32 env steps.",
+    "after each trunk and learn from sequences of 32 env steps.",
     "invalid-actions": "A knight's tour on a board of 5 x 5 squares: 25 actions, at most 8 of them "
     "valid, and 1 for each new square. Without masks an invalid action ends the episode.",
     "picture-and-number": "The right answer follows from a picture and a number together. Who sees "
@@ -101,12 +103,28 @@ def shown_label(label: str) -> str:
     return LABELS.get(label, label)
 
 
-def former_controls(cells: Iterable[Mapping[str, Any]]) -> str:
-    """Says of which kind the random controls of 0.1.0 among these are; empty if there is none."""
+def command_of(name: str) -> str:
+    """The command that trains a study today."""
+    return f"sauna study {FORMER_STUDIES.get(name, name)}"
+
+
+def former_controls(cells: Iterable[Mapping[str, Any]], studies: Iterable[str]) -> str:
+    """Says which random controls are of an earlier form of these studies, and what is trained now.
+
+    Empty if there is none.
+    """
     arms = {cell["label"]: cell["rates_of"] for cell in cells if cell.get("rates_of")}
+    if not arms:
+        return ""
     those = [f"`{shown_label(label)}` those of `{shown_label(arms[label])}`" for label in arms]
-    said = "A random control here repeated the drop rates of another run"
-    return f"{said}: {', '.join(those)}, seed by seed." if arms else ""
+    every = [arm for name in studies for arm in load_spec(name).arms]
+    now = dict.fromkeys(f"`{arm.label}`" for arm in every if arm.arm.endswith(RANDOM_CONTROL))
+    return (
+        "Random controls in these tables are of an earlier form of the study. They repeated the "
+        f"drop rates of other runs, seed by seed: {', '.join(those)}. Today the command trains "
+        f"{' and '.join(now)} instead. Such a control needs no other run: it asks the filter how "
+        "many steps it would keep, and keeps as many at random."
+    )
 
 
 def listed(sentences: Iterable[str]) -> str:

@@ -57,7 +57,7 @@ def study_page(name: str, results: Mapping[str, Any], summary: Mapping[str, Any]
         facts=_facts(results) + about,
         overview=overview(results, summary),
         legend="" if alone else _legend(summary),
-        controls=former_controls(results["cells"]),
+        controls=former_controls(results["cells"], [name]),
         caption="" if alone else CAPTION,
         decided=_decided([*summary["verdicts"], *summary["filtering"]]),
         missing=_missing(name, results),

@@ -17,6 +17,7 @@ from studies import (
     ROOT,
     STUDIES,
     TITLES,
+    command_of,
     folded,
     former_controls,
     listed,
@@ -91,7 +92,7 @@ def index(covered: float) -> str:
         covered=f"{covered:.0%}",
         revisions=_revisions(),
         former=former_controls(
-            cell for name in CLAIMED for cell in (load(name) or {"cells": []})["cells"]
+            (cell for name in CLAIMED for cell in (load(name) or {"cells": []})["cells"]), CLAIMED
         ),
         claims="\n\n".join(_claims()),
     )
@@ -111,7 +112,7 @@ def _scope(name: str) -> list[str]:
         tasks[0] if len(tasks) == 1 else str(len(tasks)),
         str(max(seeds)),
         f"{int(steps):,}",
-        f"`{load(name)['command']}`",
+        f"`{command_of(name)}`",
     ]
 
 

@@ -56,9 +56,9 @@ def _equal(runs: Mapping[str, Mapping[str, Any]]) -> str:
     steps = {run["env_steps"] for kind in runs.values() for run in kind.values()}
     exchanges = [runs["population"][seed]["exchanges"] for seed in seeds]
     head = (
-        f"**Population-based training beside random search at equal steps**, Pendulum-v1, "
+        f"**Population-based training against random search at equal steps**, Pendulum-v1, "
         f"{_spread(sorted(steps))} env steps each, eight members or trials; {len(seeds)} "
-        f"repetitions with seeds of their own ({_spread(exchanges)} exchanges):"
+        f"repetitions with different seeds ({_spread(exchanges)} exchanges):"
     )
     rows = ["| | best return of the eight | mean return of the eight |", "|---|---|---|"]
     for kind, words in (("population", "population"), ("random", "random search")):

@@ -123,7 +123,7 @@ def _seconds() -> str:
         numbers = [pair[side][name] for name in ("seconds", "return") for side in ("ours", "sb3")]
         rows.append([f"`{env}`", *(f"{number:,.1f}" for number in numbers)])
     text = (
-        f"## Seconds beside Stable-Baselines3\n\nThe same numbers, {found['seeds']} seeds of "
+        f"## Seconds next to Stable-Baselines3\n\nThe same numbers, {found['seeds']} seeds of "
         f"{found['steps']:,} env steps, two processes, one side after the other. Seconds are those "
         "from the command to its end, with imports and compilation. A return is the mean training "
         "return of the last 100 episodes."

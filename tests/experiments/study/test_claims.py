@@ -83,13 +83,13 @@ def test_it_holds_on_the_papers_tasks_and_on_no_fewer() -> None:
     assert said(results)["so"] == "holds; better over the tasks by the interval"
     for member in results["cells"][-1]["members"]:
         member["keep_rate"] = 1.0
-    assert said(results)["so"].endswith("; it drops next to nothing on Swimmer")
+    assert said(results)["so"].endswith("; it drops at most 1% of its steps on Swimmer")
 
 
 @pytest.mark.parametrize("keep_rate", [0.995, 1.0])
 def test_no_credit_for_filtering_next_to_nothing(keep_rate: float) -> None:
     row = said(study((HIGH,) * 3, keep_rate))
-    assert row["so"].endswith("; it drops next to nothing")
+    assert row["so"].endswith("; it drops at most 1% of its steps")
     assert row["keep rate"] == f"{keep_rate:.3f}"
 
 
@@ -98,7 +98,7 @@ def test_no_credit_where_it_filtered_nothing_on_the_task_it_won() -> None:
     for member in results["cells"][3]["members"]:
         member["keep_rate"] = 1.0
     assert said(results)["so"] == (
-        "better on A, not decided on the other 2; it drops next to nothing on A"
+        "better on A, not decided on the other 2; it drops at most 1% of its steps on A"
     )
 
 
