@@ -109,6 +109,7 @@ BOUNDED = (*OTHERS, *FAST, "pong_1", "pong_half", "own_slow_workers")
 # --script FILE --rounds 3 --json benchmarks/results/cheetah_1_cleanrl.json`.
 BY_HAND = ["cheetah_1_cleanrl"]
 SHORT = ("cheetah_6", "cheetah_1_cleanrl", "pong_1", "cartpole", "lunar_lander", "own_dict")
+SHORT_NAMES = {"own_dict": "a user's environment"}
 NAMES = {
     "sb3": "Stable-Baselines3",
     "cleanrl": "CleanRL's script",
@@ -117,10 +118,11 @@ NAMES = {
     "rejax": "rejax",
     "purejaxrl": "PureJaxRL's script",
 }
-# What is not equal beside the settings in the last column of the tables: a peer's code says more.
+HELD_BY_SCRIPT = {"cleanrl": "its own numbers, which preset `mujoco` has too"}
+# What is not equal besides the settings in the last column of the tables: a peer's code says more.
 NOT_EQUAL = {
     "sb3": "It steps Gymnasium's environments in `DummyVecEnv`, Atari through its own wrappers.",
-    "cleanrl": "It has numbers of its own: those of our preset `mujoco`. A time limit is an end.",
+    "cleanrl": "A time limit is an end.",
     "rltools": "Its tanh is an approximation, its Adam's epsilon 1e-7, an action is not clipped.",
     "rl_games": "It normalises values and not rewards, advantages over a rollout; it clips "
     "observations at 5; its Adam's epsilon is 1e-8; MuJoCo is EnvPool's.",
@@ -290,7 +292,8 @@ def peers_table(found: dict[str, dict[str, Any]]) -> str:
         if name in PEER_SCRIPTS:
             shown += f", its `{PEER_SCRIPTS[name]}` {peer.get('script', 'of no noted revision')}"
         equal = ", ".join(map(_named, (n for n in READ[name] if n != "env")))
-        lines.append(f"| {NAMES[name]} | {shown} | {equal or '-'} | {NOT_EQUAL[name]} |")
+        equal = equal or HELD_BY_SCRIPT[name]
+        lines.append(f"| {NAMES[name]} | {shown} | {equal} | {NOT_EQUAL[name]} |")
     return "\n".join(lines)
 
 
@@ -399,17 +402,18 @@ def _processor(one: dict[str, Any]) -> str:
 def short_table(found: dict[str, dict[str, Any]]) -> str:
     """The README's table: what was trained, how fast, and beside what."""
     lines = [
-        "| PPO on | seeds, processes | env steps/s | of the simulator alone | against |",
-        "|---|---|---|---|---|",
+        "| PPO on | processor | seeds, processes | env steps/s | of the simulator alone | against |",  # noqa: E501
+        "|---|---|---|---|---|---|",
     ]
-    for one in found.values():
+    for file, one in found.items():
         rates = sorted(one["rates"]["training"])
         peer = "-"
         if "peer" in one:
             name = one["peer"]["name"]
             peer = f"{one['ratios'][name]['median']:.1f} x {NAMES[name]}"
         lines.append(
-            f"| {one['env']} | {one['members']}, {one['processes']} | "
+            f"| {SHORT_NAMES.get(file, one['env'])} | {_processor(one)} | "
+            f"{one['members']}, {one['processes']} | "
             f"{rates[len(rates) // 2]:,.0f} | {_simulator(one)} | {peer} |"
         )
     return "\n".join(lines)
