@@ -80,7 +80,7 @@ TRAINED = (  # cheapest first
 BY_SPACES = {  # environments that the zoo does not know, for the presets that it picks for such
     "FrozenLake-v1": ("discrete", 200_000),
     "zoo_envs:long_swimmer": ("long-horizon", 1_000_000),
-    "zoo_envs:Catch": ("pictures", 500_000),
+    "zoo_envs:Catch": ("pictures", 200_000),
 }
 SHORTER = {"CarRacing-v3": 100_000}  # env steps, where those of `sauna train` take days
 # Why an environment is not among them, by a pattern of its whole name. `--only` trains it, too.

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-CELLS, PIXELS = 10, 4  # of a side of the board, of a side of a cell
+CELLS, PIXELS = 5, 8  # of a side of the board, of a side of a cell
 
 
 class Catch(gymnasium.Env[np.ndarray, int]):

@@ -36,7 +36,7 @@ def zoo_page(units: Mapping[str, Any]) -> str:
     envs = (*ENVS, *BY_SPACES)
     done = [env for env in envs if env in units]
     missing = [env for env in envs if env not in units]
-    below = [f"`{env}`: {_word(env, units[env])}" for env in done if is_below(env, units[env])]
+    below = [f"`{env}`: {_word(env, units[env])}" for env in done if needs_word(env, units[env])]
     figure = "![Training curves of three seeds each](figures/zoo.svg)\n\n" + CAPTION
     return page(
         "zoo",
@@ -104,6 +104,17 @@ def is_below(env: str, unit: Mapping[str, Any]) -> bool:
     if published is None:
         return False
     return bool(np.mean(list(unit["returns"].values())) < published.mean - published.std)
+
+
+def is_split(unit: Mapping[str, Any]) -> bool:
+    """Whether the worst seed has less than half of the best one's return, if that is positive."""
+    returns = list(unit["returns"].values())
+    return bool(max(returns) > 0 and min(returns) < 0.5 * max(returns))
+
+
+def needs_word(env: str, unit: Mapping[str, Any]) -> bool:
+    """Whether the page has to explain a return: it is below the published one, or seeds differ."""
+    return is_below(env, unit) or is_split(unit)
 
 
 def _word(env: str, unit: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from zoo import BY_SPACES, LEFT_OUT, TRAINED, is_done, plan_of, settings_of, stored
-from zoo_page import WORDS, draw_zoo, is_below, zoo_page
+from zoo_page import WORDS, draw_zoo, is_split, needs_word, zoo_page
 
 from sauna.config.zoo import ENVS, PUBLISHED, entry_of
 from sauna.training.pick import pick
@@ -46,9 +46,17 @@ def test_below_is_a_mean_lower_than_the_published_one_by_more_than_the_published
     assert "None so far." in below({"Humanoid-v5": unit(1.0, 1.0, 1.0)})  # nothing is published
 
 
+def test_seeds_that_differ_by_half_are_named() -> None:
+    assert is_split(unit(8000.0, 3999.0)) and not is_split(unit(8000.0, 4001.0))
+    assert is_split(unit(1.0, -1.0)) and not is_split(unit(-100.0, -500.0))
+    assert "not explained yet" in below({"Humanoid-v5": unit(500.0, 100.0)})
+
+
 def test_each_stored_return_below_the_published_one_has_a_word() -> None:
     """If this fails, say in `WORDS` of `results/zoo_page.py` why these are below."""
-    without = [env for env, found in stored().items() if is_below(env, found) and env not in WORDS]
+    without = [
+        env for env, found in stored().items() if needs_word(env, found) and env not in WORDS
+    ]
     assert without == []
     assert set(WORDS) <= set(PUBLISHED) & set(ENVS)
 
