@@ -483,6 +483,22 @@ def saved_table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def alternatives_table(result: dict[str, Any]) -> str:
+    """Microseconds of an update's parts, by XLA and by Numba."""
+    lines = ["| part | XLA, us | Numba, us | ratio |", "|---|---|---|---|"]
+    for one in result["products"]:
+        what = f"products of a layer {one['inputs']} x {one['outputs']}, {one['samples']:,} samples"
+        lines.append(_both(what, one))
+    for one in result["adam"]:
+        lines.append(_both(f"clipping and Adam, {one['parameters']:,} parameters", one))
+    return "\n".join(lines)
+
+
+def _both(what: str, one: dict[str, Any]) -> str:
+    xla, own = one["xla_us"], one["own_us"]
+    return f"| {what} | {xla:,.1f} | {own:,.1f} | {xla / own:.2f} |"
+
+
 def _row(values: dict[str, float]) -> str:
     return " | ".join(f"{value:.2f}" for value in values.values())
 
@@ -511,6 +527,8 @@ def main() -> None:
     peak = json.loads((RESULTS / "peak.json").read_text())
     insert(page, "others", f"{measured_on(others)}\n\n{others_table(others, peak)}")
     insert(page, "peak", peak_table(peak))
+    tried = json.loads((RESULTS / "alternatives.json").read_text())
+    insert(page, "alternatives", alternatives_table(tried))
     if fast := stored(FAST):
         insert(page, "fast", f"{measured_on(fast)}\n\n{fast_table(fast, peak)}")
     insert(page, "startup", startup_table(json.loads((RESULTS / "startup.json").read_text())))
