@@ -270,6 +270,15 @@ def test_no_number_that_is_none_is_learned_from() -> None:
     assert_held(tally.result(), 20)
 
 
+@pytest.mark.parametrize("value", VALUES)
+def test_the_first_observation_of_an_evaluation_in_a_worker_is_a_number(value: str) -> None:
+    """A worker's first episode of an evaluation begins by `start_after`, and not by `reset`."""
+    kwargs = {"field": "first", "value": value, "episode": 1}
+    envs = BACKENDS["in-process"](kwargs)
+    with pytest.raises(EnvironmentFailure, match=rf"step 0: observation\[1\] is {value}"):
+        envs.start_after(0, {"episode": np.asarray(-1)})
+
+
 def test_the_device_says_where_a_number_is_none() -> None:
     device = OnDevice()
     for env, episode, kwargs in zip(itertools.cycle([1, 2, 0]), [0, 3] * 60, cases(), strict=False):

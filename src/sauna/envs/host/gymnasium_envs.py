@@ -202,6 +202,7 @@ class GymnasiumEnvs(HostEnvs):
         slot = self._slots[index]
         slot.episode = int(snapshot["episode"])
         self._start_episode(index, slot)
+        self._check_finite(np.arange(len(self._slots)) == index)
         return self._observation[index].copy()
 
     def close(self) -> None:
