@@ -42,6 +42,18 @@ def test_the_last_observations_are_one_also_at_both_ends_of_an_episode() -> None
     assert step.final_observation.tolist() == [[4, 5]] and step.observation.tolist() == [[0, 0]]
 
 
+def test_an_observation_of_another_shape_is_not_stretched_into_a_stack() -> None:
+    class Shrinking(Finite):
+        def observe(self):
+            return super().observe()[:0] if self.t == 2 else super().observe()
+
+    env = StackedEnv(Shrinking(), 3)
+    env.reset(seed=1)
+    env.step(0)
+    with pytest.raises(ValueError, match=r"is of shape \(0,\) instead of \(1,\)"):
+        env.step(0)
+
+
 def test_wrapped_environments_can_be_copied() -> None:
     for env in (StackedEnv(Finite(), 3), MaskedEnv(Finite())):
         again = copy.deepcopy(env)

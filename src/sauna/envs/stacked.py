@@ -1,7 +1,7 @@
 """The last observations as one: one shows how things are, several show how they move.
 
-Vectors stand side by side, and so do the channels of pictures. The oldest comes first. Where an
-episode starts, its first observation stands for those before it, too.
+Vectors stand side by side, and so do the channels of pictures. The oldest comes first. At the start
+of an episode, its first observation stands for those before it, too.
 """
 
 from __future__ import annotations
@@ -60,24 +60,35 @@ class StackedEnv:
         self.observation_space = StackedSpace(env.observation_space, env.action_space, number)
         self._read = observation_reader(env.observation_space)
         self._seen = np.zeros(self.observation_space.shape, self.observation_space.dtype)
-        self._new = self._seen.shape[-1] // number
+        shape = self._seen.shape
+        self._number, self._shape = number, (*shape[:-1], shape[-1] // number)
 
     def reset(self, **how: Any) -> Any:
         answer = self.env.reset(**how)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             return answer  # refused by who reads it
-        first = self._read(answer[0])
-        for begin in range(0, self._seen.shape[-1], self._new):
-            self._seen[..., begin : begin + self._new] = first
+        self._seen[:] = np.tile(self._one(answer[0]), self._number)  # along the last axis
         return self._seen.copy(), answer[1]
 
     def step(self, action: Any) -> Any:
         answer = self.env.step(action)
         if not (isinstance(answer, tuple) and len(answer) == 5):
             return answer
-        self._seen[..., : -self._new] = self._seen[..., self._new :]
-        self._seen[..., -self._new :] = self._read(answer[0])
+        new = self._shape[-1]
+        self._seen[..., :-new] = self._seen[..., new:]
+        self._seen[..., -new:] = self._one(answer[0])
         return self._seen.copy(), *answer[1:]
+
+    def _one(self, observation: Any) -> np.ndarray:
+        """Reads one observation; another shape must not be stretched to fit.
+
+        Raises:
+          ValueError: its shape is another one.
+        """
+        read = np.asarray(self._read(observation))
+        if read.shape != self._shape:
+            raise ValueError(f"an observation is of shape {read.shape} instead of {self._shape}")
+        return read
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # also of a copy that is not complete yet

@@ -8,6 +8,7 @@ are shared over processes.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import signal
 import time
@@ -347,7 +348,8 @@ class Coordinator:
             try:
                 stops = callback(copy.deepcopy(row))
             except Exception as error:
-                replace_file(self._run.path / "failure.txt", traceback.format_exc().encode())
+                with contextlib.suppress(OSError):  # the exception counts more than its copy
+                    replace_file(self._run.path / "failure.txt", traceback.format_exc().encode())
                 error.add_note(
                     f"raised by the callback, at iteration {row['iteration']} of {row['member']}; "
                     f"continue from the last checkpoint with: {resume_command(self._run.path)}"

@@ -27,7 +27,7 @@ def stacked(env: JaxEnv, number: int) -> JaxEnv:
 
     def reset(key: Array) -> tuple[State, Array]:
         state, observation = env.reset(key)
-        seen = jnp.concatenate([read(observation)] * number, -1)
+        seen = jnp.tile(read(observation), number)  # along the last axis
         return (state, seen), seen
 
     def step(state: State, action: Any) -> Transition:

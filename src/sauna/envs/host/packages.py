@@ -58,6 +58,8 @@ def know_joints_of_mujoco_4() -> None:
     import mujoco
 
     utils = importlib.import_module("gymnasium_robotics.utils.mujoco_utils")
+    if vars(utils)["mujoco"] is not mujoco:  # it knows them already
+        return
     kinds = {name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()}
     seen = ModuleType(mujoco.__name__)
     seen.__dict__.update(mujoco.__dict__, mjtJoint=SimpleNamespace(**kinds))
