@@ -68,7 +68,8 @@ def test_a_mistake_is_found_before_the_environment_is_made() -> None:
 
 
 def test_both_interfaces_pick_and_say_so(monkeypatch, capsys, tmp_path) -> None:
-    started = []
+    started: list[dict] = []
+    (tmp_path / "config.json").touch()
 
     def start(overrides, display, *more):
         started.append(overrides)
