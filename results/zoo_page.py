@@ -27,6 +27,8 @@ WORDS = {
     "the goal in 2 of its 20 episodes.",
     "MiniGrid-Unlock-v0": f"{SAMPLED} With the most likely actions, one seed does not reach the "
     "goal in 4 of its 20 episodes.",
+    "gymnax/Breakout-MinAtar": "each seed settles in the first half of the training, at its own "
+    "level. Sampled, the last 100 training episodes of each seed have the returns {sampled}.",
     "Swimmer-v5": "RL Zoo's policy also sees the time that is left of an episode.",
 }
 
