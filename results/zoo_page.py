@@ -25,6 +25,8 @@ WORDS = {
     "`Ant-v3` they may have been 0.",
     "MiniGrid-DoorKey-5x5-v0": f"{SAMPLED} With the most likely actions, one seed does not reach "
     "the goal in 2 of its 20 episodes.",
+    "MiniGrid-KeyCorridorS3R1-v0": f"{SAMPLED} With the most likely actions, one seed does not "
+    "reach the goal in 1 of its 20 episodes.",
     "MiniGrid-Unlock-v0": f"{SAMPLED} With the most likely actions, one seed does not reach the "
     "goal in 4 of its 20 episodes.",
     "gymnax/Breakout-MinAtar": "each seed settles in the first half of the training, at its own "
