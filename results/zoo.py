@@ -82,6 +82,7 @@ BY_SPACES = {  # environments that the zoo does not know, for the presets that i
     "zoo_envs:long_swimmer": ("long-horizon", 1_000_000),
     "zoo_envs:Catch": ("pictures", 200_000),
 }
+EVERY = (*ENVS, *BY_SPACES)
 SHORTER = {"CarRacing-v3": 100_000}  # env steps, where those of `sauna train` take days
 # Why an environment is not among them, by a pattern of its whole name. `--only` trains it, too.
 LEFT_OUT = {
@@ -208,7 +209,7 @@ def _thinned(steps: np.ndarray, returns: np.ndarray) -> dict[str, list[float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--only", nargs="+", choices=(*BY_SPACES, *ENVS), metavar="ENV", default=[])
+    parser.add_argument("--only", nargs="+", choices=EVERY, metavar="ENV", default=[])
     parser.add_argument("--list", action="store_true")
     arguments = parser.parse_args()
     RUNS.mkdir(parents=True, exist_ok=True)

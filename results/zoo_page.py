@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from studies import listed, load, markdown, page
-from zoo import BY_SPACES, SHORTER, TRAINED, plan_of, planned
+from zoo import BY_SPACES, EVERY, SHORTER, TRAINED, plan_of, planned
 
 from sauna.config.zoo import ENVS, PUBLISHED, entry_of, shown_published
 from sauna.experiments.report import style
@@ -37,9 +37,8 @@ WORDS = {
 
 def zoo_page(units: Mapping[str, Any]) -> str:
     """The page, from the units of `results/zoo.json`."""
-    envs = (*ENVS, *BY_SPACES)
-    done = [env for env in envs if env in units]
-    missing = [env for env in envs if env not in units]
+    done = [env for env in EVERY if env in units]
+    missing = [env for env in EVERY if env not in units]
     below = [f"`{env}`: {_word(env, units[env])}" for env in done if needs_word(env, units[env])]
     figure = "![Training curves of three seeds each](figures/zoo.svg)\n\n" + CAPTION
     return page(
@@ -150,7 +149,7 @@ def draw_zoo(units: Mapping[str, Any], path: Path) -> Path:
     """Draws the training curves of every unit, with RL Zoo's return as a line and a band."""
     from matplotlib.figure import Figure
 
-    done = [env for env in (*ENVS, *BY_SPACES) if env in units]
+    done = [env for env in EVERY if env in units]
     rows = -(-len(done) // COLUMNS)
     look = style.looks({"ppo": "ppo"})["ppo"]
     with style.applied():

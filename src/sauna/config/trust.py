@@ -20,12 +20,13 @@ from typing import Any
 
 from sauna.config.plugins import is_local
 from sauna.config.settings import fields_with
+from sauna.config.task_presets import TASK_PRESETS
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.safe_read import read_file
 from sauna.system.safe_write import open_new, sync_folder
 
 FIELDS = (*fields_with("plugin"), "tasks", "measure", "track", "wrap")  # that may name code
-OWN_WRAPPERS = ("sauna.envs.small_grey:SmallGrey",)  # which a preset names
+OWN_WRAPPERS = {path for preset in TASK_PRESETS.values() for path in preset.get("wrap", ())}
 # Ids of Gymnasium whose arguments name an environment of another library.
 WRAPPERS = ("GymV21Environment", "GymV26Environment")
 KEY_BYTES = 32
@@ -48,8 +49,8 @@ def _named(value: Any, field: str) -> Iterator[tuple[str, str]]:
         for part in value:
             yield from _named(part, field)
     elif isinstance(value, str) and field in FIELDS:
-        names = ":" in value and not is_local(value)
-        names = names and not (field == "wrap" and value in OWN_WRAPPERS)
+        is_ours = field == "wrap" and value in OWN_WRAPPERS
+        names = ":" in value and not is_local(value) and not is_ours
         if names or any(wrapper in value for wrapper in WRAPPERS):
             yield ("env" if field == "tasks" else field), value
 

@@ -61,9 +61,8 @@ def test_fetch_can_be_made_and_shows_its_joints(module: str) -> None:
     pytest.importorskip("gymnasium_robotics")
     env = make_env(f"{module}FetchReachDense-v4", {})
     env.reset(seed=0)
-    finger = env.unwrapped.data.joint("robot0:l_gripper_finger_joint").qpos[0]
     seen = env.step(np.zeros(4, np.float32))[0]["observation"]
-    assert seen.shape == (10,) and 0 <= abs(finger) < 0.1
+    assert seen.shape == (10,)
     joint = env.unwrapped.data.joint("robot0:r_gripper_finger_joint").qpos[0]
     assert seen[3] == joint  # the gripper's first number
     env.close()
