@@ -17,6 +17,7 @@ from sauna.envs.host.contract import HostEnvs
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.packages import (
     as_vector,
+    forget_worlds,
     know_joints_of_mujoco_4,
     package_of,
     register,
@@ -55,13 +56,13 @@ def env_maker(env: str, env_kwargs: dict[str, Any]) -> Callable[..., Any]:
     if is_function_name(env):
         function = import_name("env", env)
         check_makes(env, function)
-        return plain_maker(function, env_kwargs)
+        make = plain_maker(function, env_kwargs)
+        return lambda **more: forget_worlds(make(**more))
     import gymnasium
 
     name = _registered(env)
-    return lambda **more: as_vector(
-        gymnasium.make(name, **{"disable_env_checker": True, **env_kwargs, **more})
-    )
+    kwargs = {"disable_env_checker": True, **env_kwargs}
+    return lambda **more: forget_worlds(as_vector(gymnasium.make(name, **{**kwargs, **more})))
 
 
 def one_name(env: str) -> str:

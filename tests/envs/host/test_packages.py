@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -70,4 +72,46 @@ def test_fetch_can_be_made_and_shows_its_joints(module: str) -> None:
 
 def test_other_environments_stay_as_they_are() -> None:
     env = gymnasium.make("CartPole-v1")
-    assert packages.as_vector(env) is env
+    assert packages.as_vector(env) is env and packages.forget_worlds(env) is env
+
+
+def test_a_walker_has_a_new_world_in_each_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Walker(gymnasium.Env):  # as Gymnasium's: the world of `__init__` stays
+        def __init__(self) -> None:
+            self.world, self.destroyed = object(), []
+
+        def _destroy(self) -> None:
+            self.destroyed.append(self.world)
+
+        def reset(self, **how):
+            self._destroy()
+            return self.world, {}
+
+    box2d = SimpleNamespace(b2World=object)
+    module = SimpleNamespace(BipedalWalker=Walker, Box2D=box2d)
+    monkeypatch.setitem(sys.modules, "gymnasium.envs.box2d.bipedal_walker", module)
+    walker = Walker()
+    env = packages.forget_worlds(gymnasium.Wrapper(walker))
+    worlds = [walker.world, env.reset()[0], env.reset()[0]]
+    assert len(set(map(id, worlds))) == 3 and walker.destroyed == worlds[:2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("maker, differ", [(make_env, False), (gymnasium.make, True)])
+def test_an_episode_of_the_walker_does_not_depend_on_those_before(maker, differ: bool) -> None:
+    pytest.importorskip("Box2D", reason="needs `pip install 'sauna-rl[box2d]'`")
+    name, kwargs = "BipedalWalker-v3", {} if maker is gymnasium.make else {"env_kwargs": {}}
+    actions = np.random.default_rng(0).uniform(-1, 1, (400, 4)).astype(np.float32)
+
+    def end(episodes_before: int) -> bytes:
+        env = maker(name, **kwargs)
+        for seed in range(episodes_before):
+            env.reset(seed=seed)
+        seen = env.reset(seed=0)[0]
+        for action in actions:
+            seen, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                break
+        return seen.tobytes()
+
+    assert (len({end(before) for before in range(4)}) > 1) == differ

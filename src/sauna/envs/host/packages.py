@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import re
+import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -64,6 +65,28 @@ def know_joints_of_mujoco_4() -> None:
     seen = ModuleType(mujoco.__name__)
     seen.__dict__.update(mujoco.__dict__, mjtJoint=SimpleNamespace(**kinds))
     vars(utils)["mujoco"] = seen
+
+
+def forget_worlds(env: Any) -> Any:
+    """Lets each episode of BipedalWalker (Gymnasium 1.3) begin in a new Box2D world.
+
+    Gymnasium keeps the world, whose order of contacts depends on the episodes before. The same
+    episode then ends elsewhere in an environment that has played others, and exact resume, which
+    replays it, cannot find its state again. LunarLander's world is new in each episode already.
+    Any other environment stays as it is.
+    """
+    module = sys.modules.get("gymnasium.envs.box2d.bipedal_walker")
+    walker = getattr(env, "unwrapped", None)
+    if module is None or not isinstance(walker, vars(module)["BipedalWalker"]):
+        return env
+    destroy = walker._destroy  # the first that a reset calls
+
+    def destroy_world() -> None:
+        destroy()
+        walker.world = vars(module)["Box2D"].b2World()
+
+    walker._destroy = destroy_world
+    return env
 
 
 def as_vector(env: Any) -> Any:
