@@ -23,7 +23,7 @@ from sauna.experiments.share.card import placed
 from sauna.system import run_directory
 
 ZOO = Path(__file__).parent.parent / "src" / "sauna" / "training" / "zoo"
-LARGEST = 200_000  # bytes of a policy's folder
+LARGEST = 600_000  # bytes of a policy's folder
 
 
 def best_member(run: Path) -> str:
