@@ -26,6 +26,8 @@ STUDIES = (
     "memory",
     "invalid-actions",
     "picture-and-number",
+    "late-collapse",
+    "vex-head",
 )
 CLAIMED = {  # the studies that the claims are judged by, and how the summary calls their tasks
     "fig3": "MuJoCo tasks",
@@ -49,6 +51,8 @@ TITLES = {
     "actions-bipedal": "Distributions of actions on BipedalWalker",
     "invalid-actions": "Masks of invalid actions",
     "picture-and-number": "A picture and a number together",
+    "late-collapse": "Late collapse on InvertedDoublePendulum",
+    "vex-head": "The Vex head alone, 30 fresh seeds",
     "noise": "Are the dropped steps noisier?",
     "dial": "Threshold sweep: exploration against return",
     "fig5": "HalfCheetah: on its feet or on its back",
@@ -73,6 +77,10 @@ WHY = {
     "picture-and-number": "The right answer follows from a picture and a number together. Who sees "
     "one of them alone gets 4 of 16 by chance.",
     "pong": "One seed is no comparison. It shows how far a million env steps go on Atari.",
+    "late-collapse": "Some seeds of PPO lose late what they had learned. Do they update too often? "
+    "`target-kl` ends an update early, and one arm takes half of the epochs.",
+    "vex-head": "The head helped on two tasks with six seeds, undecided. Thirty seeds that no "
+    "other study used decide it.",
     "noise": "The paper says that the dropped samples are noisy. The policy gradient of dropped "
     "steps was measured at five checkpoints of each seed.",
     "dial": "The paper says that the threshold trades exploration for exploitation. Thresholds "

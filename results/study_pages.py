@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from collapse import collapse_text
 from studies import (
     DECIDED,
     TITLES,
@@ -47,14 +48,15 @@ PUBLISHED = {
 def study_page(name: str, results: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
     """A study's page: table, figure, decided comparisons; the rest is folded."""
     alone = len(summary["table"]) == 1
-    about = f" {pong_text(results)}" if name == "pong" else ""
+    about = ABOUT[name](results) if name in ABOUT else ""
     tasks = "\n\n".join(_of_task(task, name, results, summary) for task in summary["curves"])
     return page(
         "study",
         name=name,
         title=TITLES[name],
         why=WHY[name],
-        facts=_facts(results) + about,
+        facts=_facts(results),
+        about=about,
         overview=overview(results, summary),
         legend="" if alone else _legend(summary),
         controls=former_controls(results["cells"], [name]),
@@ -296,3 +298,7 @@ def pong_text(results: Mapping[str, Any]) -> str:
         f"One seed of PPO (`{results['command']}`): the mean training score of the last 100 games "
         f"rises from {low:.1f} after {early:,} env steps to {high:.1f} after {late:,}."
     )
+
+
+# What a page says of its study alone.
+ABOUT = {"pong": pong_text, "late-collapse": collapse_text}
