@@ -83,7 +83,8 @@ BY_SPACES = {  # environments that the zoo does not know, for the presets that i
     "zoo_envs:Catch": ("pictures", 200_000),
 }
 EVERY = (*ENVS, *BY_SPACES)
-SHORTER = {"CarRacing-v3": 100_000}  # env steps, where those of `sauna train` take days
+# Env steps, if those of `sauna train` take long.
+SHORTER = {"CarRacing-v3": 100_000, "MiniGrid-RedBlueDoors-6x6-v0": 600_000}
 # Why an environment is not among them, by a pattern of its whole name. `--only` trains it, too.
 LEFT_OUT = {
     r"ALE/.+|BipedalWalkerHardcore-v3|sauna/HumanoidFlagrunHarder-v0": "days on two cores",

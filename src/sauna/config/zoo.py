@@ -18,6 +18,7 @@ AUTO = "auto"  # the preset that stands for the one of the environment
 LONG = 1000  # env steps; a time limit above is a long horizon
 
 RL_ZOO = "RL Zoo's numbers"
+RL_ZOO_BONUS = "RL Zoo's numbers with an entropy bonus of our own"
 OWN = "own numbers"
 
 
@@ -61,8 +62,8 @@ ZOO = (
     Entry(r"gymnax/.+-MinAtar", "minatar", 10_000_000, "PureJaxRL's numbers"),
     Entry(rf"playground/(?:{PLAYGROUND})", "playground", 60_000_000, OWN),
     Entry(r"sauna/HumanoidFlagrun\w*-v\d+", "flagrun", 100_000_000, SCHULMAN),
-    Entry(r"MiniGrid-FourRooms-v\d+", "minigrid-long", 5_000_000, RL_ZOO),
-    Entry(r"MiniGrid-RedBlueDoors-\w+-v\d+", "minigrid-long", 1_000_000, RL_ZOO),
+    Entry(r"MiniGrid-FourRooms-v\d+", "minigrid-long", 5_000_000, RL_ZOO_BONUS),
+    Entry(r"MiniGrid-RedBlueDoors-\w+-v\d+", "minigrid-long", 1_000_000, RL_ZOO_BONUS),
     Entry(r"MiniGrid-(?:Empty|DoorKey|Unlock)-.+", "minigrid", 100_000, RL_ZOO),
     Entry(r"MiniGrid-KeyCorridor.+", "minigrid", 500_000, RL_ZOO),
     Entry(r"MiniGrid-(?:Fetch|GoToDoor)-.+", "minigrid", 5_000_000, RL_ZOO),
