@@ -47,6 +47,20 @@ def test_a_run_that_learns_nothing_fails(tmp_path, capsys) -> None:
     assert "warning: sauna+own_rules.nothing/0: the rule kept no sample of iteration 0" in said
 
 
+@pytest.mark.parametrize(
+    "rule",
+    [
+        {"sampler": "gigaflow", "sampler_kwargs": {"threshold": 2.0}},
+        {"stop": "espo", "stop_kwargs": {"limit": 0.0}, "clip_range": 0.2},
+    ],
+)
+def test_a_run_without_the_head_that_learns_nothing_fails(rule, tmp_path, capsys) -> None:
+    settings = {**SMALL, "steps": 32 * 12, **rule}
+    with pytest.raises(SaunaError, match="in 10 iterations in a row"):
+        sauna.train("small_envs:Scripted", out=tmp_path / "r", **settings)
+    assert "or stopped its update at once" in capsys.readouterr().out
+
+
 def test_a_minibatch_of_one_sample_is_refused() -> None:
     with pytest.raises(BadInput, match="minibatches: 32 of 32 samples leave 1 each"):
         sauna.train("small_envs:Scripted", **{**SMALL, "minibatches": 32})

@@ -35,11 +35,11 @@ class EmptyUpdates:
                 self._said.add(member)
                 warnings.append(
                     f"warning: {member}: the rule kept no sample of iteration {row['iteration']}, "
-                    f"so nothing was learned from it"
+                    f"or stopped its update at once, so nothing was learned from it"
                 )
             if self._empty[member] == MAX_EMPTY:
                 raise SaunaError(
-                    f"{member}: the rule kept no sample in {MAX_EMPTY} iterations in a row; "
-                    f"lower its threshold, or leave it out"
+                    f"{member}: the rule kept no sample in {MAX_EMPTY} iterations in a row, or "
+                    f"stopped their updates at once; change its threshold, or leave it out"
                 )
         return warnings

@@ -59,8 +59,9 @@ def metrics_row(
     for name, value in scalars.items():
         if name not in ("finite", "work") and math.isfinite(value):
             row[name] = float(value)
-    if "vex_target" in row and not float(hypers.vex_coef):
-        del row["vex_loss"], row["vex_target"]  # nothing learns them in this arm
+    if not float(hypers.vex_coef):  # nothing learns them in this arm
+        row.pop("vex_loss", None)
+        row.pop("vex_target", None)
     row.setdefault("learning_rate", float(hypers.learning_rate))
     for name in ("clip_range", "entropy_coef"):
         if getattr(config, f"{name}_schedule") != "constant":
