@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,7 @@ from helpers import SMALL, environment, own
 from sauna.experiments.evaluate.policy import TrainedPolicy
 from sauna.experiments.report.curve import interval, member_curves
 from sauna.system import run_directory
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, SaunaError
 from sauna.training.artifact import load_artifact
 from small_envs import Finite, Scripted
 
@@ -155,10 +156,25 @@ def test_evaluation_does_not_change_the_run_and_repeats(result) -> None:
     assert row["mean"] == pytest.approx(np.mean(row["returns"]))
     only = sauna.evaluate(str(result.path), member=0, episodes=4, seed=5)
     assert only["members"] == {"sauna/0": row}
-    with pytest.raises(BadInput, match="at least 1"):
-        sauna.evaluate(result.path, episodes=0)
+    for name, value in (("episodes", 0), ("episodes", 2.5), ("seed", -1), ("max_steps", "x")):
+        with pytest.raises(BadInput, match=f"{name}: must be a whole number of at least"):
+            sauna.evaluate(result.path, **{name: value})
     after = (sorted((result.path / "checkpoints").iterdir())[-1] / "state.safetensors").read_bytes()
     assert before == after
+
+
+def test_none_is_not_given(result, tmp_path) -> None:
+    resumed = sauna.resume(result.path, steps=None, quiet=True)
+    assert resumed.metrics == result.metrics
+    with pytest.raises(BadInput, match="gamma: "):  # it came past the steps
+        sauna.compare("CartPole-v1", steps=None, gamma="x", out=tmp_path)
+
+
+def test_a_run_that_was_cut_short_has_no_summary_yet(result, tmp_path) -> None:
+    shutil.copytree(result.path, tmp_path / "run")
+    (tmp_path / "run" / "summary.json").unlink()
+    with pytest.raises(SaunaError, match="has no summary yet"):
+        _ = sauna.Result(tmp_path / "run").summary
 
 
 def test_tensorboard_holds_the_same_numbers(result) -> None:

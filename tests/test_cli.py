@@ -40,7 +40,7 @@ BAD = [
     (["train", ENV, "--seeds=-1,2"], "seeds: must lie between"),
     (["train", ENV, "--gamma", "1.1"], "gamma: must be at most 1"),
     (["train", ENV, "--gamma", "nan"], "gamma: must be a finite number"),
-    (["train", ENV, "--hidden", ""], "hidden: cannot read"),
+    (["train", ENV, "--hidden", ""], "hidden: empty"),
     (["train", ENV, "--env-kwargs", '{"a": [0, Infinity]}'], "JSON has no infinity and no NaN"),
     (["train", ENV, "--arm", "ppo", "--threshold", "0.5"], "threshold: not read by arm ppo"),
     (["train", ENV, "--arm", "ppo", "--filter", "sauna"], "filter: fixed by arm ppo"),
@@ -320,6 +320,8 @@ def test_config_goes_through_json_unchanged() -> None:
         ("clip_value", "no", False),
         ("learning_rate", "3e-4", 3e-4),
         ("arm", "ppo, sauna", ("ppo", "sauna")),
+        ("wrap", "", ()),  # none of the preset's
+        ("value_hidden", "", ()),
     ],
 )
 def test_values_are_read(name, text, value) -> None:

@@ -67,7 +67,13 @@ class Result:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """`member name -> final numbers`, as in `summary.json`."""
+        """`member name -> final numbers`, as in `summary.json`.
+
+        Raises:
+          SaunaError: the run has not come to an end, so that it has no summary yet.
+        """
+        if not (self.path / "summary.json").is_file():
+            raise SaunaError(f"{self.path} has no summary yet: it was cut short, or still trains")
         return run_directory.read_config_file(self.path / "summary.json")["members"]
 
     def plot(self) -> Any:
@@ -209,7 +215,8 @@ def compare(
     """
     from sauna.experiments.study.command import chosen_arms, compare_command, comparison, study
 
-    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
+    given = {n: v for n, v in settings.items() if v is not None}  # as in `train`
+    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in given.items()}}
     for name in PARTS:
         if is_local(str(overrides.get(name))):
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
@@ -251,9 +258,10 @@ def resume(
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    named = {n: _named(n, v) if n == "track" else v for n, v in changes.items()}
+    given = {n: v for n, v in changes.items() if v is not None}  # as in `train`
+    named = {n: _named(n, v) if n == "track" else v for n, v in given.items()}
     rest = provide(Path(path), named, PARTS)
-    how = trust, accept_changed_code, restart_schedule
+    how = trust, accept_changed_code, restart_schedule, inexact, callback
     run = runs.reopen(Path(path), rest, display, *how)
     train_and_draw(run, display, resume=True, inexact=inexact, callback=callback)
     return Result(run.path)

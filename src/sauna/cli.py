@@ -301,11 +301,11 @@ def _resume(values: dict[str, Any]) -> None:
     from sauna.training.display import make_display
 
     path = Path(values.pop("run"))
-    names = ("inexact", "trust", "accept_changed_code", "restart_schedule")
-    inexact, *how = (values.pop(name) for name in names)
+    names = ("trust", "accept_changed_code", "restart_schedule", "inexact")
+    how = [values.pop(name) for name in names]
     display = make_display()
     run = runs.reopen(path, values, display, *how)
-    train_and_draw(run, display, resume=True, inexact=inexact)
+    train_and_draw(run, display, resume=True, inexact=how[-1])
     _print_curve(path)
 
 
@@ -340,7 +340,7 @@ def _set_up_playing(values: dict[str, Any]) -> None:
     least = {"episodes": 1, "seed": 0, "max_steps": 1}
     if values.get("checkpoint") is not None:
         least["checkpoint"] = 0
-    values |= {name: whole_number(values, name, number) for name, number in least.items()}
+    values |= {name: whole_number(name, values[name], number) for name, number in least.items()}
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
     os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "0")  # a step waits for each action
@@ -400,7 +400,7 @@ def _study(values: dict[str, Any]) -> None:
 def _run_study(spec: Any, command: str, *, out: str, processes: str, **place: Any) -> None:
     from sauna.experiments.study.command import lines, study
 
-    jobs = whole_number({"processes": processes}, "processes", 0)
+    jobs = whole_number("processes", processes, 0)
     summary = study(spec, Path(out), command, jobs, **place)
     print("\n".join(lines(summary)))
     print(f"\nreport: {Path(out) / spec.name / 'report.html'}")

@@ -87,7 +87,7 @@ def test_masks_are_recorded_beside_the_observations(tmp_path, kept, by) -> None:
 def test_what_cannot_be_recorded_is_refused(run, tmp_path) -> None:
     for to, more, message in (
         ("a.csv", {}, "neither minari:NAME nor a file that ends in .parquet"),
-        ("a.parquet", {"episodes": 0}, "episodes: must be at least 1"),
+        ("a.parquet", {"episodes": 0}, "episodes: must be a whole number of at least 1, not 0"),
         ("a.parquet", {"member": "ppo/7"}, "unknown member 'ppo/7'"),
         ("a.parquet", {"env": "small_envs:Scripted"}, "has other spaces than the run"),
     ):

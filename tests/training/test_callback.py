@@ -109,3 +109,44 @@ def test_callbacks_do_not_run_on_several_machines(tmp_path: Path) -> None:
 def test_stopped_indices_are_whole_numbers_of_one_type() -> None:
     """The coordinator and a worker write the same bytes."""
     assert np.asarray(STOPS.index("callback")).dtype == np.int64
+
+
+def test_what_a_callback_returns_by_accident_does_not_stop_the_training(tmp_path: Path) -> None:
+    def log(row: dict[str, Any]) -> Any:
+        return (tmp_path / "log").write_text(str(row["iteration"]))  # the number of characters
+
+    with played_back(record()), pytest.raises(TypeError, match="callback returned a int; True"):
+        sauna.train(ENV, out=tmp_path / "run", quiet=True, callback=log, **SAVED, **SETTINGS)
+
+
+def test_an_error_of_a_callback_s_own_files_is_not_taken_for_one_of_the_run(tmp_path: Path) -> None:
+    def fail(row: dict[str, Any]) -> None:
+        raise TimeoutError("the server is away")
+
+    with played_back(record()), pytest.raises(TimeoutError, match="server is away") as caught:
+        sauna.train(ENV, out=tmp_path / "run", quiet=True, callback=fail, **SAVED, **SETTINGS)
+    assert caught.value.__cause__ is None and caught.value.__context__ is None
+
+
+def test_a_stop_at_the_last_iteration_is_no_early_one(tmp_path: Path) -> None:
+    with trained_here():
+        result = sauna.train(
+            ENV,
+            out=tmp_path / "run",
+            quiet=True,
+            callback=lambda row: row["iteration"] == 5,
+            **SETTINGS,
+        )
+    assert [row["iteration"] for row in result.metrics] == [*range(6)]
+    assert "stopped_early" not in result.summary["ppo/0"]
+
+
+def test_a_resume_that_is_refused_changes_nothing(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with played_back(record()):
+        sauna.train(ENV, out=run, quiet=True, **SAVED, **SETTINGS)
+    before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    with pytest.raises(BadInput, match="callback: must be a function of a row"):
+        sauna.resume(run, steps=10**6, callback=5, quiet=True)
+    after = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    assert after == before and examine(run).state == "finished"

@@ -128,7 +128,7 @@ def _check_evaluations(config: Config, batch: int) -> None:
       BadInput: naming the last env step of the run.
     """
     last = config.steps // batch * batch
-    if config.eval_every > last and config.filter == "none":
+    if config.eval_every > last and (config.filter == "none" or config.budget == "env"):
         raise BadInput(
             f"eval_every: the run ends after {last:,} env steps, before the first evaluation"
         )
@@ -309,6 +309,12 @@ def own_parts(config: Config) -> list[str]:
     """Names the fields that hold a part of the user's own besides the environment."""
     names = (name for name in fields_with("plugin") if name != "env")
     return [name for name in names if ":" in getattr(config, name)]
+
+
+def has_room(config: Config, env_steps: int, kept_steps: int) -> bool:
+    """Returns whether a whole rollout still fits in the budget after these steps of a member."""
+    used = kept_steps if config.budget == "kept" else env_steps
+    return config.steps - used >= config.rollout_steps * config.envs
 
 
 def budget_note(config: Config) -> str:

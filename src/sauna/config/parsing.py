@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import typing
-from collections.abc import Mapping
 from typing import Any
 
 from sauna.system.errors import BadInput
@@ -33,7 +32,9 @@ def read_value(name: str, value: Any, field_type: Any) -> Any:
         return float(value)
     if typing.get_origin(field_type) is tuple:
         item = typing.get_args(field_type)[0]
-        parts = value.split(",") if isinstance(value, str) else list(value)
+        if isinstance(value, str):
+            value = value.split(",") if value.strip() else []
+        parts = list(value)
         if len(parts) > MAX_VALUES:
             raise BadInput(f"{name}: {len(parts)} values are too many; at most {MAX_VALUES}")
         return tuple(str(part).strip() if item is str else _integer(part) for part in parts)
@@ -116,12 +117,29 @@ def _json_value(value: Any) -> Any:
     )
 
 
-def whole_number(values: Mapping[str, Any], name: str, least: int) -> int:
-    """The text of option `name` as a whole number of at least `least`.
+def whole_number(name: str, value: Any, least: int) -> int:
+    """Reads option `name` as a whole number of at least `least`.
 
     Raises:
       BadInput: it is something else.
     """
-    if not values[name].isdigit() or int(values[name]) < least:
-        raise BadInput(f"{name}: must be a whole number of at least {least}")
-    return int(values[name])
+    try:
+        number = _integer(value)
+    except (ValueError, TypeError):
+        number = least - 1
+    if number < least:
+        raise BadInput(f"{name}: must be a whole number of at least {least}, not {value}")
+    return number
+
+
+def what_is_played(episodes: Any, seed: Any, max_steps: Any) -> tuple[int, int, int]:
+    """Reads how many episodes are played, from which seed on, and of how many env steps at most.
+
+    Raises:
+      BadInput: one of them is no whole number, or too small.
+    """
+    return (
+        whole_number("episodes", episodes, 1),
+        whole_number("seed", seed, 0),
+        whole_number("max_steps", max_steps, 1),
+    )

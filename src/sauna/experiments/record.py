@@ -12,6 +12,7 @@ import numpy as np
 
 from sauna import __version__
 from sauna.config.imported_from import names_the_folder
+from sauna.config.parsing import what_is_played
 from sauna.envs.host.answers import close, one_number
 from sauna.envs.host.together import group_size
 from sauna.envs.make import make_env
@@ -76,8 +77,7 @@ def record(
       BadInput: as `evaluate`; or `to` is there already, is no name, or needs a library.
     """
     run, to = locate(run).folder, str(to)  # an environment may go elsewhere
-    if episodes < 1 or seed < 0 or max_steps < 1:
-        raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    episodes, seed, max_steps = what_is_played(episodes, seed, max_steps)
     if not to.startswith(MINARI) and Path(to).suffix != ".parquet":
         raise BadInput(f"to: {to!r} is neither minari:NAME nor a file that ends in .parquet")
     to = to if to.startswith(MINARI) else str(Path.cwd() / to)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sauna.config.checks import local_parts
+from sauna.config.checks import has_room, local_parts
 from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory, watchdog
 from sauna.system.errors import BadInput, Interrupted, SaunaError, one_line, warn
@@ -43,6 +43,15 @@ from sauna.training.worker import serve, write_job
 
 # Sees a row of `metrics.jsonl`; its member stops if it returns True.
 Callback = Callable[[dict[str, Any]], bool | None]
+
+
+class CallbackRaised(Exception):
+    """Carries what the user's callback raised past those who would take it for an error of ours."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
+
 
 LEAD = 2  # iterations that a process may be ahead of the slowest one
 SECONDS_AHEAD = 2.0  # on the device, where a call runs several: what a signal may have to wait
@@ -347,6 +356,11 @@ class Coordinator:
         for row in rows:
             try:
                 stops = callback(copy.deepcopy(row))
+                if not isinstance(stops, bool | np.bool_ | None):
+                    raise TypeError(
+                        f"the callback returned a {type(stops).__name__}; True stops the member, "
+                        f"False or None does not"
+                    )
             except Exception as error:
                 with contextlib.suppress(OSError):  # the exception counts more than its copy
                     replace_file(self._run.path / "failure.txt", traceback.format_exc().encode())
@@ -354,8 +368,8 @@ class Coordinator:
                     f"raised by the callback, at iteration {row['iteration']} of {row['member']}; "
                     f"continue from the last checkpoint with: {resume_command(self._run.path)}"
                 )
-                raise
-            if stops:
+                raise CallbackRaised(error) from error
+            if stops and has_room(self._run.config, row["env_steps"], row["kept_steps"]):
                 self._stopped.setdefault(row["member"], self._iteration + 1)
 
     def _write_summary(self, complete: bool, arrays: Mapping[str, np.ndarray]) -> None:

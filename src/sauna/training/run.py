@@ -6,6 +6,7 @@ once, and the training itself happens in the workers that `coordinator.py` start
 
 from __future__ import annotations
 
+import inspect
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -236,6 +237,8 @@ def reopen(
     trust: bool = False,
     accept_changed_code: bool = False,
     restart_schedule: bool = False,
+    inexact: bool = False,
+    callback: Any = None,
 ) -> Run:
     """Opens an existing run, to be continued; from then on it counts as this user's.
 
@@ -244,6 +247,7 @@ def reopen(
       trust: the code that it names may run, even if another user named it.
       accept_changed_code: go on with that code even if it is not what it was.
       restart_schedule: schedules begin anew, over the steps that are added.
+      inexact, callback: what `train_run` will be called with; they are only checked here.
 
     Raises:
       BadInput: it is not a run, is in use, names code of somebody else's, or `changes` would change
@@ -269,6 +273,7 @@ def reopen(
     check_writes(changed.config)
     if (changed.config.backend == "device") != (before.config.backend == "device"):
         raise BadInput("backend: a run on the device stays there, and one on the host there")
+    check_call(changed.config, inexact, callback)
     prepared = examine(changed, parsed)
     _check_spaces(prepared, path, stored["spaces"])
     with disk_errors(path):
@@ -295,6 +300,37 @@ def reopen(
     if text := describe_extension(before.config, after.config):
         display.say(text)
     return run
+
+
+def check_call(config: Config, inexact: bool, callback: Any) -> None:
+    """Checks what a training or a resume is called with, beside its settings.
+
+    Raises:
+      BadInput: the callback cannot be called here, or `inexact` means nothing.
+    """
+    if inexact and config.backend == "device":
+        raise BadInput("inexact: a run on the device brings its environments back exactly")
+    _check_callback(callback)
+    if callback is not None and config.distributed:
+        raise BadInput("callback: not called with distributed")
+
+
+def _check_callback(callback: Any) -> None:
+    """Refuses what cannot be called with a row.
+
+    Raises:
+      BadInput: saying what it must be.
+    """
+    if callback is None:
+        return
+    if not callable(callback):
+        raise BadInput(f"callback: must be a function of a row, not {type(callback).__name__}")
+    try:
+        inspect.signature(callback).bind({})
+    except TypeError as error:
+        raise BadInput(f"callback: cannot be called with a row: {error}") from None
+    except ValueError:  # a function of C, which does not say what it takes
+        pass
 
 
 def _check_source(path: Path, stored: Mapping[str, Any]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,11 +15,11 @@ from sauna.envs.spaces import difference, read_spaces
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import check_logs, cut_logs, damage_of
-from sauna.training.coordinator import Callback, Coordinator
+from sauna.training.coordinator import Callback, CallbackRaised, Coordinator
 from sauna.training.display import Display
 from sauna.training.extension import GOES_FURTHER
 from sauna.training.initial import load_initial
-from sauna.training.run import Run, disk_errors
+from sauna.training.run import Run, check_call, disk_errors
 from sauna.training.tracking.trackers import chosen, last_steps
 
 
@@ -48,39 +47,22 @@ def train_run(
       BadInput: a setting cannot be used after all, as a worker found; a new run is removed again.
       Interrupted: a signal came; the state is saved.
       SaunaError: something failed; the last good checkpoint is on disk.
+      Exception: what the callback raised.
     """
+    raised = None
     try:
-        if inexact and run.config.backend == "device":
-            raise BadInput("inexact: a run on the device brings its environments back exactly")
-        _check_callback(callback)
-        if callback is not None and run.config.distributed:
-            raise BadInput("callback: not called with distributed")
+        check_call(run.config, inexact, callback)
         with disk_errors(run.path):
             return _train(run, display, resume, inexact, callback, draw, until)
     except BadInput:
         if not resume:  # what a worker found to be one before the first row: nothing is created
             run_directory.discard(run.path, run.made)
         raise
+    except CallbackRaised as error:
+        raised = error.error
     finally:
         run.lock.close()
-
-
-def _check_callback(callback: Any) -> None:
-    """Refuses what cannot be called with a row.
-
-    Raises:
-      BadInput: saying what it must be.
-    """
-    if callback is None:
-        return
-    if not callable(callback):
-        raise BadInput(f"callback: must be a function of a row, not {type(callback).__name__}")
-    try:
-        inspect.signature(callback).bind({})
-    except TypeError as error:
-        raise BadInput(f"callback: cannot be called with a row: {error}") from None
-    except ValueError:  # a function of C, which does not say what it takes
-        pass
+    raise raised  # here, where it gets no other context than the user's
 
 
 def _train(

@@ -142,6 +142,14 @@ def test_a_member_that_stops_early_changes_no_other(both) -> None:
     assert again.rows == [] and equal(again.final, stopped.final)
 
 
+def test_a_return_that_is_reached_at_the_end_of_the_budget_stops_nothing(both) -> None:
+    backend, _, whole = both
+    reached = train_here(of(backend, stop_at=-1e9, **{**WATCHED, "eval_every": 192}))
+    assert [row["env_steps"] for row in reached.rows] == [row["env_steps"] for row in whole.rows]
+    assert any("eval_return_mean" in row for row in reached.rows)
+    assert not any(name.endswith("counters/stopped") for name in reached.final)
+
+
 class Stopping(Recorder):
     """Stops one member once a row of iteration 1 was seen, as a callback does."""
 
@@ -238,8 +246,9 @@ def test_what_only_evaluations_read_is_refused_without_them(name: str, tmp_path:
 def test_evaluations_that_would_never_come_are_refused(tmp_path: Path) -> None:
     last = r"eval_every: the run ends after 64 env steps, before the first evaluation"
     settings = {**SMALL, "steps": 64 + 31, "eval_every": 65, "out": tmp_path / "run"}
-    with pytest.raises(BadInput, match=last):
-        sauna.train("small_envs:Scripted", **settings)
+    for arm in ("ppo", "sauna"):
+        with pytest.raises(BadInput, match=last):
+            sauna.train("small_envs:Scripted", **{**settings, "arm": arm})
     assert list(tmp_path.iterdir()) == []
 
 

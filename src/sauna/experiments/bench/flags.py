@@ -29,7 +29,8 @@ def bench_from_flags(values: dict[str, Any], say: Callable[[str], None]) -> None
     if scale and unread:
         raise BadInput(f"{unread[0]}: not read with --scale")
     values.setdefault("iterations", "50")
-    rounds, iterations = whole_number(values, "rounds", 1), whole_number(values, "iterations", 2)
+    rounds = whole_number("rounds", values["rounds"], 1)
+    iterations = whole_number("iterations", values["iterations"], 2)
     against, file = values.pop("against"), values.pop("json")
     if file and not Path(file).resolve().parent.is_dir():
         raise BadInput(f"json: {Path(file).parent} is not a folder")

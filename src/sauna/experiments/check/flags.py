@@ -31,7 +31,7 @@ def check_from_flags(values: dict[str, Any]) -> None:
     """
     from sauna.experiments.check.findings import WRONG, check
 
-    steps = whole_number(values, "steps", 1)
+    steps = whole_number("steps", values["steps"], 1)
     found = check(values["env"], values["env_kwargs"] or {}, steps)
     print("\n".join(map(printable, found.facts)))
     for finding in found.findings:

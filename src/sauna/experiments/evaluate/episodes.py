@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sauna.config.imported_from import names_the_folder
+from sauna.config.parsing import what_is_played
 from sauna.config.plugins import is_local, name_of, provide
 from sauna.config.settings import fields_with, parse
 from sauna.envs.host.answers import close
@@ -92,8 +93,7 @@ def evaluate(
       VideoFailure: a video was asked for and the environment cannot render here.
     """
     run, written = locate(run)
-    if episodes < 1 or seed < 0 or max_steps < 1:
-        raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    episodes, seed, max_steps = what_is_played(episodes, seed, max_steps)
     artifact = load_artifact(run, say, checkpoint, trust=trust)
     env = provided(run, env, parts)
     chosen = artifact.members if member is None else [find_member(artifact.members, member)]

@@ -8,6 +8,7 @@ from pathlib import Path
 from sauna.config.code import changed_code, code_of
 from sauna.config.imported_from import names_the_folder
 from sauna.config.own_sources import newer_sources
+from sauna.config.parsing import what_is_played
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
@@ -54,8 +55,7 @@ def inspect(
       BadInput: no such run or member, impossible numbers, or a page that cannot be put there.
     """
     run = Path.cwd() / run  # an environment may go elsewhere
-    if episodes < 1 or seed < 0 or max_steps < 1:
-        raise BadInput("episodes: must be at least 1, as max_steps, and seed at least 0")
+    episodes, seed, max_steps = what_is_played(episodes, seed, max_steps)
     stored = run_directory.read_config(run, needed=())  # an exported policy knows no training
     artifact = load_artifact(run, say, trust=trust)
     name = find_member(artifact.members, 0 if member is None else member)

@@ -65,7 +65,7 @@ def _read(values: dict[str, Any]) -> dict[str, Any]:
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("PJRT_NPROC", "1")
     given = {name: value for name, value in values.items() if value not in (None, False)}
-    return given | {n: whole_number(given, n, 0) for n in ("episodes", "seed") if n in given}
+    return given | {n: whole_number(n, given[n], 0) for n in ("episodes", "seed") if n in given}
 
 
 def push_from_flags(values: dict[str, Any]) -> None:

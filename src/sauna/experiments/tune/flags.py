@@ -100,8 +100,8 @@ def tune_from_flags(values: dict[str, Any], say: Callable[[str], None]) -> None:
     from sauna.experiments.tune.results import PAGE, lines
 
     options = {name: values.pop(name) for name in _TUNING}
-    options |= {name: whole_number(options, name, 0) for name in _WHOLE}
-    jobs = whole_number(values, "processes", 0)
+    options |= {name: whole_number(name, options[name], 0) for name in _WHOLE}
+    jobs = whole_number("processes", values["processes"], 0)
     own = ("processes", "on", "address", "out", "trust", "accept_changed_code")
     where = {name: values.pop(name) for name in own}
     if not values["env"]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from sauna.algorithm.rollout.collected import capacity
 from sauna.algorithm.types import Array, Hypers
+from sauna.config.checks import has_room
 from sauna.config.settings import Config
 from sauna.training.loop.job import Setting
 from sauna.training.loop.member_state import Counters
@@ -18,10 +19,7 @@ def budget_left(config: Config, counters: Counters) -> bool:
 
     A member that was stopped early has none left.
     """
-    if counters.stopped:
-        return False
-    used = counters.kept_steps if config.budget == "kept" else counters.env_steps
-    return config.steps - used >= config.rollout_steps * config.envs
+    return not counters.stopped and has_room(config, counters.env_steps, counters.kept_steps)
 
 
 def step_limit(config: Config, counters: Counters) -> int:

@@ -24,6 +24,7 @@ from sauna.config.settings import Config
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure
 from sauna.system.checkpoint import under
 from sauna.system.errors import one_line
+from sauna.training.loop.budget import budget_left
 from sauna.training.loop.job import Arrays, Job
 from sauna.training.loop.member_state import Counters, fitting, named_params
 from sauna.training.loop.players import Frozen, Play
@@ -129,7 +130,7 @@ class Evaluator:
         """Evaluates member `p` if its iteration reached a multiple of `eval_every`.
 
         Args:
-          counters: of the member, after the iteration; `stopped` is set if it has to stop.
+          counters: of the member, after the iteration; `stopped` is set if it has to stop early.
           steps_before: its env steps before the iteration.
 
         Returns:
@@ -147,7 +148,9 @@ class Evaluator:
         episodes = self._episodes(member, now, numbers)
         found = self._found[p]
         row = found.see(episodes, counters.env_steps, partial(named_frozen, self._policy, now))
-        counters.stopped = found.stop(self._config, row["eval_return_mean"])
+        stop = found.stop(self._config, row["eval_return_mean"])
+        if budget_left(member.config, counters):  # else it has ended anyway
+            counters.stopped = stop
         self.seconds += time.perf_counter() - clock
         return row
 
