@@ -59,3 +59,27 @@ def test_the_command_that_continues_a_run_is_quoted_for_a_shell(tmp_path: Path) 
         run_directory.create(run)
     command = str(refused.value).split("`")[1]
     assert shlex.split(command) == ["sauna", "resume", str(run)]
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_run_without_a_row_leaves_nothing_behind(made: bool, tmp_path: Path) -> None:
+    """Also what its trackers wrote before a worker found the settings unusable."""
+    run = tmp_path / "run"
+    for folder in ("initial", "tensorboard"):
+        (run / folder).mkdir(parents=True)
+        (run / folder / "file").write_text("x")
+    for name in ("config.json", ".lock", "tracking.json", "metrics.csv"):
+        (run / name).write_text("{}")
+    (tmp_path / "mine").mkdir()
+    (run / "link").symlink_to(tmp_path / "mine")
+    run_directory.discard(run, made)
+    assert run.exists() != made and (tmp_path / "mine").is_dir()
+    assert not made or list(tmp_path.iterdir()) == [tmp_path / "mine"]
+    assert made or list(run.iterdir()) == []
+
+
+def test_a_run_with_rows_is_kept(tmp_path: Path) -> None:
+    for name in ("config.json", "metrics.jsonl"):
+        (tmp_path / name).write_text("")
+    run_directory.discard(tmp_path, made=True)
+    assert len(list(tmp_path.iterdir())) == 2

@@ -122,13 +122,18 @@ def create(path: Path, new: bool = False) -> None:
 
 
 def discard(path: Path, made: bool) -> None:
-    """Empties the directory of a run that has no row yet, and removes it where the run made it."""
+    """Empties the directory of a run that has no row yet, and removes it where the run made it.
+
+    All that it holds is the run's and its trackers', as it was empty when the run began.
+    """
     if any((path / name).exists() for name in LOGS):
         return
     with contextlib.suppress(OSError):  # the first error is reported already, and matters more
-        (path / "config.json").unlink(missing_ok=True)
-        (path / ".lock").unlink(missing_ok=True)
-        shutil.rmtree(path / INITIAL, ignore_errors=True)
+        for child in path.iterdir():
+            if child.is_dir() and not child.is_symlink():
+                shutil.rmtree(child, ignore_errors=True)
+            else:
+                child.unlink(missing_ok=True)
         if made:
             path.rmdir()
 

@@ -169,6 +169,36 @@ def test_a_failing_tracker_ends_alone_with_one_line(tmp_path: Path, failing: str
     assert good.calls[-1] == ("close",)
 
 
+class FailsOnce(Listed):
+    away: ClassVar[bool] = True
+
+    def row(self, row: Any) -> None:
+        if row["env_steps"] == 20 and self.away:
+            raise OSError("no network")
+        super().row(row)
+
+
+def test_a_tracker_that_failed_gets_what_it_missed(tmp_path: Path, monkeypatch) -> None:
+    written: list[dict[str, Any]] = []
+    monkeypatch.setattr("sauna.system.run_directory.rows", lambda *_: written)
+    monkeypatch.setattr(FailsOnce, "away", True)
+
+    def given(rows: list[list[dict[str, Any]]]) -> list[tuple[str, int]]:
+        trackers, _ = opened(tmp_path, "FailsOnce", last_steps(written))
+        for two in rows:
+            trackers.rows(two, CLOCK)
+            written.extend(two)
+        trackers.close()
+        (one,) = Listed.made
+        return [call[1:3] for call in one.calls if call[0] == "row"]
+
+    assert given([ROWS, LATER]) == [("ppo/0", 10), ("ppo/1", 10)]
+    assert given([]) == []  # it is still away
+    monkeypatch.setattr(FailsOnce, "away", False)
+    assert given([]) == [("ppo/0", 20), ("ppo/1", 20)]
+    assert given([]) == []  # now it is a tracker like any other
+
+
 def test_a_tracker_that_fails_at_the_end_is_named(tmp_path: Path) -> None:
     trackers, said = opened(tmp_path, "Closed,Listed")
     trackers.close()

@@ -26,6 +26,7 @@ KNOWN = {
 }
 _FAILURES = (Exception, SystemExit)  # how a tracker may fail: some libraries call sys.exit
 FILE = "tracking.json"  # of the run directory: what each tracker needs to find its run again
+ENDED = "ended"  # its key for trackers that failed: the env steps of each member's last row there
 
 
 def chosen(config: Config) -> list[str]:
@@ -75,7 +76,7 @@ def last_steps(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
 class Trackers:
     """All trackers of a run. What one of them raises ends that one, with a line that says so.
 
-    A tracker that is new to a run gets the rows of before first.
+    A tracker that is new to a run gets the rows of before first; one that failed, those since then.
 
     Args:
       path: the run directory.
@@ -98,7 +99,9 @@ class Trackers:
             for one in members
         }
         self._before = done
-        self._done: dict[str, Mapping[str, int]] = {}
+        self._done: dict[str, dict[str, int]] = {}
+        self._kept: dict[str, Any] = {}
+        self._ended: dict[str, Any] = {}
         self._open: dict[str, Tracker] = {}
         self.urls: dict[str, dict[str, str]] = {}
 
@@ -107,28 +110,32 @@ class Trackers:
         names = chosen(self._config)
         if not names:
             return
-        kept = self._kept()
+        self._kept = self._read()
+        self._ended = _dict(self._kept.pop(ENDED, None)) or {}
         for name in names:
-            before = kept.get(name) if isinstance(kept.get(name), dict) else None
-            self._done[name] = {} if before is None else self._before
-            earlier = run_directory.rows(self._path) if before is None else []
+            before, ended = _dict(self._kept.get(name)), _dict(self._ended.get(name))
+            done = self._before if ended is None else ended
+            self._done[name] = {} if before is None else dict(done)
+            is_behind = before is None or ended is not None
+            earlier = run_directory.rows(self._path) if is_behind else []
             run = TrackedRun(self._path, self._config.track_project, self._members, before or {})
             try:
                 self._open[name] = tracker = _made(name)
                 found = tracker.open(run)
                 urls = _urls(found)
-                kept[name] = found
+                self._kept[name] = found
                 for row in earlier:
-                    tracker.row(row)
+                    self._give(name, row, row)
+                self._ended.pop(name, None)
             except _FAILURES as error:
                 self._end(name, error)
                 continue
             if urls:
                 self.urls[name] = urls
                 self._say(f"{name}: {', '.join(dict.fromkeys(urls.values()))}")
-        run_directory.write_json(self._path / FILE, kept)
+        self._keep()
 
-    def _kept(self) -> dict[str, Any]:
+    def _read(self) -> dict[str, Any]:
         """What the trackers of before have left, by which they find the run again."""
         file = self._path / FILE
         try:
@@ -137,13 +144,26 @@ class Trackers:
             self._say(f"warning: cannot read {file}: {error}; trackers begin anew")
             return {}
 
+    def _keep(self) -> None:
+        ended = {ENDED: self._ended} if self._ended else {}
+        run_directory.write_json(self._path / FILE, self._kept | ended)
+
+    def _give(self, name: str, row: Mapping[str, Any], whole: Mapping[str, Any]) -> None:
+        """Gives a tracker a row, unless it has it."""
+        done, member, steps = self._done[name], row["member"], row["env_steps"]
+        if steps > done.get(member, -1):
+            self._open[name].row(whole)
+            done[member] = steps
+
     def rows(self, rows: Sequence[Mapping[str, Any]], timing: Mapping[str, float]) -> None:
         """Takes the rows of one iteration, and what a clock says of it."""
         for row in rows:
             whole = {**row, **timing}
             for name in list(self._open):
-                if row["env_steps"] > self._done[name].get(row["member"], -1):
-                    self._call(name, lambda tracker, row=whole: tracker.row(row))  # type: ignore[misc]
+                try:
+                    self._give(name, row, whole)
+                except _FAILURES as error:
+                    self._end(name, error)
 
     def summary(self, members: Mapping[str, Mapping[str, Any]], complete: bool) -> None:
         """Takes the final numbers of each member."""
@@ -169,6 +189,8 @@ class Trackers:
 
     def _end(self, name: str, error: BaseException) -> None:
         self._say(f"warning: {name} ended, the training goes on: {one_line(error)}")
+        self._ended[name] = self._done[name]
+        self._keep()
         tracker = self._open.pop(name, None)
         try:
             if tracker is not None:
@@ -180,6 +202,10 @@ class Trackers:
 def _made(name: str) -> Tracker:
     found = _class_of(name)
     return found if isinstance(found, Tracker) else found()
+
+
+def _dict(value: Any) -> dict[str, Any] | None:
+    return value if isinstance(value, dict) else None
 
 
 def _urls(kept: Any) -> dict[str, str]:
