@@ -175,6 +175,14 @@ def test_only_steps_that_all_curves_have_are_compared() -> None:
         results_of([long, later], "")
 
 
+def test_runs_of_different_tasks_are_not_compared() -> None:
+    x = np.arange(0.0, 2001.0, 100.0)
+    one = Source("a", "A-v0", "", Path("a"), {}, {0: Curve(x, x)})
+    other = Source("b", "B-v0", "", Path("b"), {}, {0: Curve(x, x)})
+    with pytest.raises(BadInput, match="runs of different tasks cannot be compared: A-v0, B-v0"):
+        results_of([one, other], "")
+
+
 def test_a_comparison_says_where_each_arm_ends_and_writes_a_report(tmp_path: Path) -> None:
     low, high = (
         write_csv(tmp_path / name, top, end)

@@ -20,18 +20,19 @@ from gymnasium.spaces import Box, Discrete
 from command_line import sauna, sauna_here, small_flags
 from helpers import SMALL, environment
 from sauna.api import compare
-from sauna.config.presets import ARMS, COMPARED
+from sauna.config.presets import ARMS, COMPARED, resolve_run
 from sauna.config.settings import parse, to_json
 from sauna.envs.spaces import describe
 from sauna.experiments.measure.measurement import find_measurement
-from sauna.experiments.study.command import compare_command, comparison
+from sauna.experiments.study.command import _check_runs, compare_command, comparison
 from sauna.experiments.study.execute.process import UnitProcess
-from sauna.experiments.study.results import _ended
+from sauna.experiments.study.results import _ended, cell_command
 from sauna.experiments.study.spec import built_in, check, load_spec, read_spec
 from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.units import SEEDS, mark_split, parts, seeds_per_unit, units_of
 from sauna.system import run_directory
 from sauna.system.errors import BadInput
+from sauna.training.pick import pick
 
 TWO = {"tasks": ["A-v0"], "seeds": 6, "arms": [{"label": "ppo"}, {"label": "sauna"}]}
 QUICK = {key: value for key, value in SMALL.items() if key != "seeds"}
@@ -246,6 +247,31 @@ def test_its_units_are_those_of_a_study_with_the_same_settings() -> None:
     ours = comparison("Hopper-v5", ("ppo", "sauna"), {"threshold": 0.8})
     fig3 = {u.name for u in units_of(load_spec("fig3"), SEEDS)}
     assert {u.name for u in units_of(ours, SEEDS)} < fig3
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "HalfCheetah-v5", "LunarLander-v3"])
+def test_the_command_of_a_cell_trains_what_the_cell_is_of(env: str) -> None:
+    """Also where `sauna train ENV` alone would pick another preset, and other steps."""
+    spec = comparison(env, ("ppo", "target-kl"), {"steps": 4096} if env == "CartPole-v1" else {})
+    for arm in spec.arms:
+        _, task, *flags = cell_command(arm, env).removeprefix("sauna ").split()
+        names = [name.removeprefix("--").replace("-", "_") for name in flags[::2]]
+        typed = {"env": task, **dict(zip(names, flags[1::2], strict=True))}
+        again = resolve_run(pick(typed).overrides).config
+        assert to_json(again) == to_json(check(arm, env))
+
+
+def test_each_arm_is_checked_with_the_spaces_that_its_wrappers_show() -> None:
+    """`small-cnn` fits the pictures of the second arm, and not the vectors of the first."""
+    arms = (
+        {"label": "plain", "arm": "ppo"},
+        {"label": "pictures", "arm": "ppo", "wrap": "wrappers:Pictured", "network": "small-cnn"},
+    )
+    study = {"name": "both", "tasks": ["CartPole-v1"], "baseline": "plain", "arms": list(arms)}
+    _check_runs(read_spec(study))
+    study["arms"][1]["wrap"] = "wrappers:broken"
+    with pytest.raises(BadInput, match="wrappers:broken cannot wrap the environment"):
+        _check_runs(read_spec(study))
 
 
 def test_the_default_control_differs_from_its_arm_in_the_control_alone() -> None:

@@ -21,6 +21,7 @@ from sauna.config.presets import (
 )
 from sauna.config.trust import check_trusted, covers, named_code, seal
 from sauna.envs.probe import Probe
+from sauna.envs.wrapping import wrapping_of
 from sauna.experiments.sequential import DESIGN
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
@@ -195,14 +196,14 @@ def _check_runs(spec: Spec) -> None:
     Raises:
       BadInput: an environment or settings that cannot be used; the arm is named.
     """
-    found: dict[tuple[str, ...], Probe] = {}
+    found: dict[tuple[Any, ...], Probe] = {}
     for arm in spec.arms:
         for task in arm.tasks:
             placed = place(resolved(arm, task))
             config = placed.config
             if spec.measure and config.backend == "device":
                 raise BadInput(f"backend: measure needs environments on the host, not {task}")
-            key = task, config.env_kwargs, config.backend
+            key = task, config.env_kwargs, config.backend, wrapping_of(config)
             if key not in found:
                 found[key] = look_at(config)
             try:

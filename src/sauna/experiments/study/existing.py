@@ -93,10 +93,12 @@ def results_of(sources: Sequence[Source], command: str) -> dict[str, Any]:
     """Returns the curves as `results.json` has them, cut where the first of them ends.
 
     Raises:
-      BadInput: there is no env step that all curves have.
+      BadInput: the runs are of several tasks, or no env step is on all curves.
     """
     tasks = list(dict.fromkeys(source.task for source in sources if source.task))
-    task = ", ".join(tasks) or "the task"
+    if len(tasks) > 1:
+        raise BadInput(f"runs of different tasks cannot be compared: {', '.join(tasks)}")
+    task = tasks[0] if tasks else "the task"
     curves = [curve for source in sources for curve in source.seeds.values()]
     start, end = max(c.x[0] for c in curves), min(c.x[-1] for c in curves)
     if start >= end:

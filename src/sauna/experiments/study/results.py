@@ -95,8 +95,14 @@ def _cell(arm: Arm, task: str, units: list[Unit], folder: Path) -> dict[str, Any
 
 
 def cell_command(arm: Arm, task: str) -> str:
-    """Returns what a user types to train the members of one arm on one task."""
-    flags = {**arm.settings, "arm": arm.arm, "seeds": arm.seeds}
+    """Returns what a user types to train the members of one arm on one task.
+
+    It names the preset and the steps, as `sauna train TASK` alone would pick those of the zoo.
+    """
+    config = check(arm, task)
+    usual = {name: getattr(config, name) for name in ("preset", "steps")}
+    missing = {name: value for name, value in usual.items() if name not in arm.settings}
+    flags = {**missing, **arm.settings, "arm": arm.arm, "seeds": arm.seeds}
     text = " ".join(typed(key, value) for key, value in flags.items())
     return f"sauna train {shlex.quote(task)} {text}"
 
