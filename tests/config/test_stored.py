@@ -64,6 +64,14 @@ def test_the_same_run_again_is_given_by_what_is_stored(
     assert resolve_run(overrides_of(read_stored(stored))) == fresh
 
 
+def test_what_is_usual_for_an_environment_alone_is_given_again() -> None:
+    """Actions of the published tasks are not rescaled unless a run says so."""
+    run = resolve_run({"env": "Ant-v5", "rescale_actions": True})
+    assert overrides_of(run)["rescale_actions"] is True
+    assert resolve_run(overrides_of(run)) == run
+    assert "rescale_actions" not in overrides_of(resolve_run({"env": "Ant-v5"}))
+
+
 @pytest.mark.parametrize("overrides", RUNS, ids=lambda run: run["arm"])
 def test_the_arms_of_runs_of_0_1_0_are_found(overrides: dict[str, Any]) -> None:
     """They held what the user gave, and each arm's values were derived from that."""

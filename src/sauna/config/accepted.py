@@ -39,11 +39,19 @@ def translate(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def over(stored: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Puts what is typed over what a file says; `--seed` replaces its seeds, and so on."""
-    replaced = {"seed": "seeds", "batch_size": "minibatches", "target_kl": "stop"}
-    gone = [replaced[name] for name in typed if name in replaced and replaced[name] not in typed]
-    gone += ["stop_kwargs"] * ("stop" in gone)
+    """Puts what is typed over what a file says.
+
+    `--seed` replaces its seeds and `--seeds` its seed, and so on. A rule that is typed does not get
+    the arguments of the rule in the file.
+    """
+    gone = [other for pair in _SAME for name, other in (pair, pair[::-1]) if name in typed]
+    named = {"stop" if name == "target_kl" else name for name in typed}
+    gone += [f"{name}_kwargs" for name in named if stored.get(name) != typed.get(name)]
     return {k: v for k, v in stored.items() if k not in gone} | dict(typed)
+
+
+# A setting that is accepted, and the field that it is another form of.
+_SAME = (("seed", "seeds"), ("batch_size", "minibatches"), ("target_kl", "stop"))
 
 
 def _stop_at(limit: Any, given: Mapping[str, Any]) -> dict[str, Any]:

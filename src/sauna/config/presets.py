@@ -311,9 +311,10 @@ def overrides_of(run: RunConfig) -> dict[str, Any]:
     """
     named = {name: getattr(run.config, name) for name in ("arm", "preset", "algorithm")}
     _check_arms(run.config.arm, named)
-    usual = {arm: arm_config(arm, named) for arm in run.config.arm}
+    of_env = {**named, "env": run.config.env}  # some defaults are an environment's
+    usual = {arm: arm_config(arm, of_env) for arm in run.config.arm}
     shared = _shared(usual)
-    found = dict(named)
+    found = {**of_env, "steps": run.config.steps}  # whatever the zoo's entry says one day
     for arm, config in run.arms.items():
         today = _member_config(usual[arm], shared)
         for name in FIELDS:

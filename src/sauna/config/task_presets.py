@@ -197,7 +197,7 @@ TASK_PRESET_HELP = {
     "bipedal-walker-hardcore": "BipedalWalkerHardcore with RL Zoo's numbers",
     "car-racing": "CarRacing with RL Zoo's numbers: pairs of small grey pictures",
     "minigrid": "MiniGrid with RL Zoo's numbers",
-    "minigrid-long": "the same with rollouts of 512 steps and an entropy bonus (FourRooms, RedBlueDoors)",
+    "minigrid-long": "the same with rollouts of 512 steps and a bonus (FourRooms, RedBlueDoors)",
     "playground": "MuJoCo Playground's control tasks: 2048 environments on an accelerator",
     "robotics": "dense reaching tasks of Gymnasium-Robotics: eight environments",
     "discrete": "discrete actions: as mujoco, with an entropy bonus",
