@@ -19,7 +19,7 @@ from sauna.experiments.bench.peer_settings import GYMNAX_PEERS, peer_settings
 from sauna.experiments.bench.peers import peer_rate
 from sauna.experiments.bench.rates import Clock, alternate, physics_rate, ratio, simulator
 from sauna.experiments.bench.split import SECTIONS, Timers, split
-from sauna.system.errors import BadInput
+from sauna.system.errors import BadInput, SaunaError
 
 POLE = "gymnax/CartPole-v1"
 
@@ -380,6 +380,18 @@ def test_a_training_is_prolonged_until_it_takes_the_seconds(monkeypatch) -> None
 
 
 @pytest.mark.slow
+def test_the_start_is_measured_with_the_preset_of_the_bench_and_without_evaluations() -> None:
+    given = {"env": "LunarLander-v3", "eval_every": 500, "eval_episodes": 1, "stop_at": 3.0}
+    expected = {"env": "LunarLander-v3", "preset": "mujoco", "steps": 2 * 2048}
+    assert command.two_iterations(given) == expected  # `sauna train` alone picks another
+
+
+def test_a_start_that_fails_is_one_line(monkeypatch) -> None:
+    monkeypatch.setattr(command, "two_iterations", lambda given: {"env": "none"})
+    with pytest.raises(SaunaError, match="bench: sauna train with these settings: exit 2"):
+        command.start_and_memory({})
+
+
 def test_a_whole_bench_writes_its_figures(tmp_path, capsys) -> None:
     file = tmp_path / "bench.json"
     small = ["--seeds=2", "--rounds=1", "--iterations=2", "--rollout-steps=64", "--minibatches=4"]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sauna.config.presets import plain, resolve
+from sauna.config.settings import FIELDS
 from sauna.experiments.bench.peer_settings import LACKS, peer_settings
 from sauna.experiments.bench.peers import peer_rate, prepare, script_digest, versions
 from sauna.experiments.bench.rates import (
@@ -26,8 +27,10 @@ from sauna.experiments.bench.rates import (
 )
 from sauna.experiments.bench.scale import scale
 from sauna.system import run_directory
+from sauna.system.errors import SaunaError
 
 RECORDS = ("checks", "logging", "checkpoints")  # what a trainer without them would save
+EVALUATION = [name for name, field in FIELDS.items() if field.metadata["group"] == "evaluation"]
 SECONDS = 15.0  # that a peer or the physics is measured in each round
 
 
@@ -138,14 +141,20 @@ def _split_elsewhere(overrides: Mapping[str, Any], share: int) -> dict[str, floa
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
+def two_iterations(overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns settings for `sauna train`: the bench's preset, two iterations, no evaluations."""
+    config = resolve(overrides)
+    values = {name: value for name, value in overrides.items() if name not in EVALUATION}
+    return values | {"preset": config.preset, "steps": 2 * config.rollout_steps * config.envs}
+
+
 def start_and_memory(overrides: Mapping[str, Any]) -> dict[str, float]:
     """Seconds from the command to the end of the first iteration, and the memory of one process.
 
     A second run of the same settings, so that the compilation cache is warm. The first env step
     comes before the first row does; the time reported is the later one.
     """
-    values = dict(overrides)
-    values["steps"] = resolve(values).rollout_steps * resolve(values).envs * 2
+    values = two_iterations(overrides)
     with tempfile.TemporaryDirectory() as folder:
         settings = Path(folder) / "settings.json"
         settings.write_text(json.dumps({**values, "out": os.path.join(folder, "run")}))
@@ -160,6 +169,8 @@ def start_and_memory(overrides: Mapping[str, Any]) -> dict[str, float]:
             if not (log.exists() and log.read_text()):
                 first = time.time() - clock
             time.sleep(0.02)
+        if started.returncode:
+            raise SaunaError(f"bench: sauna train with these settings: exit {started.returncode}")
         rows = [json.loads(line) for line in log.read_text().splitlines()]
     return {
         "seconds_to_first_row": first,
