@@ -118,20 +118,21 @@ def test_values_that_make_no_single_environment_are_refused(tmp_path: Path) -> N
         assert not (tmp_path / "run").exists()
 
 
-def test_an_id_that_this_program_registered_trains_in_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["ShortPole-v0", "mine/ShortPole-v0"])
+def test_an_id_that_this_program_registered_trains_in_it(name: str, tmp_path: Path) -> None:
     """Also one whose class another process would find: its time limit is here alone."""
     entry = "gymnasium.envs.classic_control.cartpole:CartPoleEnv"
-    gymnasium.register("ShortPole-v0", entry_point=entry, max_episode_steps=3)
+    gymnasium.register(name, entry_point=entry, max_episode_steps=3)
     try:
-        assert known_in_this_process_alone("ShortPole-v0")
+        assert known_in_this_process_alone(name)
         assert not known_in_this_process_alone("CartPole-v1")
-        run = sauna.train("ShortPole-v0", quiet=True, out=tmp_path / "run", **SMALL)
+        run = sauna.train(name, quiet=True, out=tmp_path / "run", **SMALL)
         lengths = [n for row in run.metrics for n in row["episode_lengths"]]
         assert lengths and set(lengths) == {3}
         with pytest.raises(BadInput, match="other processes cannot import it"):
-            sauna.compare("ShortPole-v0", out=tmp_path / "compared")
+            sauna.compare(name, out=tmp_path / "compared")
     finally:
-        del gymnasium.registry["ShortPole-v0"]
+        del gymnasium.registry[name]
 
 
 def test_render_mode_among_the_arguments_gives_way() -> None:

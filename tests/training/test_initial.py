@@ -18,7 +18,7 @@ from sauna.system import checkpoint, run_directory
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
 from sauna.training.artifact import _reward_moments
-from sauna.training.initial import Source, _source_of, read_initial
+from sauna.training.initial import Source, _matters, _source_of, read_initial
 from sauna.training.prepare import prepare
 from threads import trained_here
 
@@ -153,6 +153,11 @@ def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> No
         with pytest.raises(BadInput, match=f"has other spaces than {other}: "):
             sauna.train(other, out=tmp_path / "new", quiet=True, init_from=str(run), **SETTINGS)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("env", "matters"), [("CartPole-v1", False), ("Pendulum-v1", True)])
+def test_how_actions_are_rescaled_matters_to_continuous_ones_alone(env: str, matters: bool) -> None:
+    assert _matters("rescale_actions", prepare({"env": env, **SETTINGS})) == matters
 
 
 def test_a_foreign_run_is_refused_until_it_is_trusted(trained, tmp_path, monkeypatch) -> None:

@@ -165,9 +165,9 @@ def _with_colon(env: str) -> str:
 def known_in_this_process_alone(env: str) -> bool:
     """Whether this program registered an id itself: another process would not find it."""
     gymnasium = sys.modules.get("gymnasium")
-    if ":" in env or "/" in env or gymnasium is None or env not in gymnasium.registry:
+    if ":" in env or gymnasium is None or env not in gymnasium.registry:
         return False
-    if package_of(env) is not None:
+    if env.startswith(("ALE/", "sauna/")) or package_of(env) is not None:
         return False
     own = Path(gymnasium.envs.__file__).read_text(encoding="utf-8")  # registers them one by one
     return f'"{env}"' not in own

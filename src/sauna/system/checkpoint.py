@@ -4,7 +4,7 @@
 
 The folder's number is the iteration that the state is at the start of. A checkpoint is written
 beside its place, flushed to disk, and renamed; older ones are pruned only after that. Reading
-trusts nothing: see `untrusted.py`.
+trusts nothing: see `safe_read.py`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import numpy as np
 
 from sauna.config.checks import is_read
 from sauna.config.presets import Member
-from sauna.config.settings import Config
+from sauna.config.settings import FIELDS, Config
 from sauna.envs.spaces import difference
 from sauna.system import checkpoint
 from sauna.system.errors import BadInput
@@ -113,15 +113,18 @@ def check_fits(artifact: Artifact, prepared: Prepared) -> None:
         raise BadInput(f"init_from: {name} has other spaces than {ours.env}: {differs}")
     for field in SHAPES:
         before, now = getattr(theirs, field), getattr(ours, field)
-        if before != now and _matters(field, ours):
+        if before != now and _matters(field, prepared):
             raise BadInput(
                 f"init_from: {field} is {_text(before)} in {name}, and {_text(now)} here; that run "
                 f"has preset {theirs.preset}"
             )
 
 
-def _matters(field: str, config: Config) -> bool:
-    return is_read(field, config)
+def _matters(field: str, prepared: Prepared) -> bool:
+    """Whether the run reads a field, with its settings and its spaces."""
+    needs = FIELDS[field].metadata["needs_spaces"]
+    fits = needs is None or needs[1](prepared.spaces)
+    return fits and is_read(field, prepared.config)
 
 
 def _text(value: Any) -> str:

@@ -1,6 +1,6 @@
 """Collecting a rollout inside the compiled program, from environments that are pure functions.
 
-The same rollout that `collect/host.py` fills, step by step: what is observed enters the moments
+The same rollout that `rollout/host.py` fills, step by step: what is observed enters the moments
 before the policy sees it, the filter decides at once, and with `dropped="replace"` the loop goes
 on until every environment has kept T steps or tried all it may. Each environment writes its own
 column and stops writing when it is full; what stays empty is not valid and gets weight 0.
@@ -80,7 +80,7 @@ class Collecting(NamedTuple):
     env: JaxEnv  # flat
     policy: Policy
     filter: StepFilter | None
-    any_member: Callable[[Array], Array]  # see `jax_env.advance`
+    any_member: Callable[[Array], Array]  # see `envs.device.contract.advance`
     normalized: int  # numbers of an observation, the first, that have running moments
 
 

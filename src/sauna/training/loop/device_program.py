@@ -75,7 +75,7 @@ def make_iteration(config: Config, spaces: Spaces, env: JaxEnv, any_member: Any)
 
     Args:
       env: flat, of `spaces`.
-      any_member: see `jax_env.advance`.
+      any_member: see `envs.device.contract.advance`.
     """
     policy = make_policy(config, spaces)
     rule = make_filter(config)
