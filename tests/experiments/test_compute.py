@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sauna.experiments import compute
 from sauna.experiments.compute import (
     GRID,
     Curves,
@@ -107,6 +108,11 @@ def test_an_arm_that_does_not_get_there() -> None:
     base = curves([0.0, 100.0], [0.0, 10.0], [0.0, 12.0])
     arm = curves([0.0, 500.0], [0.0, 3.0], [0.0, 5.0])
     assert compute_ratio(arm, base) == (None, None, None)
+
+
+def test_the_interval_has_as_many_resamples_as_every_other_one() -> None:
+    """The protocol of the study `selection` promises 10,000."""
+    assert compute.RESAMPLES == 10_000
 
 
 def test_one_seed_has_no_interval() -> None:

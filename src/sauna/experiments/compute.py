@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.experiments.statistics import QUANTILES, SEED, mean_interval
+from sauna.experiments.statistics import QUANTILES, RESAMPLES, SEED, mean_interval
 
-RESAMPLES = 2_000
 GRID = 60  # points of a drawn curve at most
 # What compute is counted in: the key of a curve, and its name.
 AXES = {

@@ -55,3 +55,22 @@ def test_an_arm_that_never_gets_there() -> None:
     assert text == "mine: does not reach ppo's final return on A-v0."
     (text,) = said(BASE, cell("mine", [0.0, 22.0, 30.0]))  # one seed
     assert text.endswith("in samples 0.25, without an interval.")
+
+
+def test_a_failed_seed_keeps_the_mean_from_the_level() -> None:
+    """The seeds that are left are those that trained well: they alone would flatter the arm."""
+    well = cell("mine", [0.0, 22.0, 30.0], [0.0, 22.0, 30.0])
+    (found,) = compute_verdicts([BASE, well._replace(failed=1)])
+    assert found["ratios"] == {"samples_backward": [None, None, None]}
+    assert found["text"] == (
+        "mine: does not reach ppo's final return on A-v0, as 1 of 3 seeds failed."
+    )
+    (text,) = said(BASE, cell("mine")._replace(failed=5))
+    assert text.endswith("as 5 of 5 seeds failed.")
+
+
+def test_a_baseline_with_a_failed_seed_gives_no_level() -> None:
+    """Its mean is the worst outcome: every arm would be there at once."""
+    well = cell("mine", [0.0, 22.0, 30.0], [0.0, 22.0, 30.0])
+    (text,) = said(BASE._replace(failed=1), well)
+    assert text.startswith("ppo: 1 of 4 seeds failed on A-v0, so no ratio of compute is given")

@@ -1,4 +1,4 @@
-"""`results/selection_page.py`: the words of the table rule x task."""
+"""`results/selection_page.py` and what it is made of: words, marks, tables of a task."""
 
 from __future__ import annotations
 
@@ -7,11 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 import selection_page
-from selection_page import arms, difference_interval, word_of, words_of
+from selection_arms import arms, share_to_level
+from selection_trainings import seeds_said
+from selection_words import (
+    difference_interval,
+    shown_chance,
+    shown_improvement,
+    word_of,
+    words_of,
+)
 
 from sauna.experiments.study.summary import summarize
+from selection_cells import BASE, cell, study
 
-BASE = np.array([100.0, 101.0, 99.0, 100.5, 99.5])
+NONE = np.full(5, -np.inf)  # what seeds that failed are compared as
 
 
 @pytest.mark.parametrize(
@@ -24,6 +33,9 @@ BASE = np.array([100.0, 101.0, 99.0, 100.5, 99.5])
         ([0.6, 0.4, 0.8], BASE + np.array([-40, 40, 0, -20, 20]), "not decided"),
         ([0.6, None, None], BASE[:1], "not decided"),
         ([0.6, 0.4, 0.8], BASE[:1], "not decided"),  # one seed has no interval
+        # Without the failed seed the means would be the same.
+        ([0.4, 0.2, 0.7], np.array([*BASE[:4], -np.inf]), "not decided"),
+        ([0.0, 0.0, 0.55], NONE[:3], "worse"),
     ],
 )
 def test_words(improvement: list[float | None], own: np.ndarray, expected: str) -> None:
@@ -41,44 +53,13 @@ def test_welchs_interval_by_hand() -> None:
     assert difference_interval(BASE * 0, BASE * 0 + 1) == (-1.0, -1.0)
 
 
-def cell(label: str, returns: np.ndarray, samples: float) -> dict[str, Any]:
-    """Curves that rise linearly from 0 to each seed's final return."""
-    share = np.linspace(0, 1, 11)
-    members = [
-        {
-            "seed": seed,
-            "status": "complete",
-            "final_return": final,
-            "auc": final / 2,
-            "keep_rate": 1.0,
-            "env_steps": 1000,
-            "kept_steps": 1000,
-            "samples_backward": samples,
-            "curve": {
-                "env_steps": (1000 * share).tolist(),
-                "return_mean": (final * share).tolist(),
-                "samples_backward": (samples * share).tolist(),
-            },
-        }
-        for seed, final in enumerate(returns.tolist())
-    ]
-    baseline = None if label == "ppo" else "ppo"
-    return {
-        "task": "A-v5",
-        "label": label,
-        "arm": label,
-        "baseline": baseline,
-        "members": members,
-    }
-
-
 def test_a_cell_says_the_word_the_probability_and_the_share_of_compute() -> None:
     cells = [
         cell("ppo", BASE, 1000.0),
         cell("half", BASE + 50, 500.0),
         cell("low", BASE - 50, 500.0),
     ]
-    results = {"format": 1, "baseline": "ppo", "cells": cells, "settings": {}}
+    results = study(*cells)
     summary = summarize(results)
     words = words_of(results, summary)
     assert set(words) == {("half", "A-v5"), ("low", "A-v5")}
@@ -86,8 +67,8 @@ def test_a_cell_says_the_word_the_probability_and_the_share_of_compute() -> None
     half, low = words["half", "A-v5"], words["low", "A-v5"]
     assert half.shown.startswith('<span class="better">better</span> 1.00<br>x 0.33 [')
     assert low.shown.startswith('<span class="worse">worse</span> 0.00<br>not reached')
-    assert "| `half` | 5 | 0 | 150.0 ± 0.8 |" in arms("A-v5", summary)
-    assert "0.50 of PPO's" in arms("A-v5", summary)
+    assert "| `half` | 5 | 0 | 150.0 ± 0.8 |" in arms("A-v5", results, summary)
+    assert "| `half` | 0.50 of PPO's | x 0.33 [" in arms("A-v5", results, summary)
 
 
 def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +77,7 @@ def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> N
 
     def on(task: str, *cells: dict[str, Any]) -> dict[str, Any]:
         of_task = [{**own, "task": task} for own in cells]
-        return {"format": 1, "baseline": "ppo", "cells": of_task, "settings": {}}
+        return study(*of_task)
 
     ppo, high = cell("ppo", BASE, 1000.0), cell("high", BASE + 50, 1000.0)
     low, control = cell("low", BASE - 50, 1000.0), cell("low+random", BASE + 50, 1000.0)
@@ -107,5 +88,136 @@ def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(selection_page, "load", found.get)
     answer = selection_page.screen_answer()
     assert answer is not None
+    assert answer.startswith("**not decided** after 5 seeds on 1 of 8 tasks and")
     assert "on 1 of 8 tasks and a part of 1 more. By the intervals" in answer
     assert "better on a task: `high`, and 1 of 2 scored worse on a task" in answer
+
+
+def shown(*cells: dict[str, Any]) -> dict[str, str]:
+    """What the table shows of each arm on the only task."""
+    results = study(*cells)
+    return {label: c.shown for (label, _), c in words_of(results, summarize(results)).items()}
+
+
+def test_failed_seeds_never_flatter_an_arm() -> None:
+    """The seeds that are left are better than PPO, and would reach its return at once."""
+    base, well = cell("ppo", BASE), BASE + 50
+    found = {n: shown(base, cell("spo", well[n:], failed=n))["spo"] for n in range(6)}
+    assert found[0].startswith('<span class="better">better</span> 1.00<br>x 0.67 [')
+    for n in range(1, 6):
+        word = "worse" if n == 5 else "not decided"
+        assert f">{word}</span> {1 - n / 5:.2f}<br>not reached<br>{n} of 5 failed" in found[n]
+    assert "-<br>" not in shown(base, cell("spo", BASE[:0], failed=3))["spo"]
+    assert ">worse</span> 0.00" in shown(base, cell("spo", BASE[:0], failed=3))["spo"]
+    lost = study(base, cell("spo", BASE[:0], failed=5))
+    assert "| `spo` | 0 | 5 | - | - | 0.00 [" in arms("A-v5", lost, summarize(lost))
+
+
+def test_an_arm_is_not_the_same_as_ppo_if_a_seed_failed() -> None:
+    base = cell("ppo", BASE)
+    assert ">same<" in shown(base, cell("spo", BASE + 0.1))["spo"]
+    assert ">not decided<" in shown(base, cell("spo", BASE[1:] + 0.1, failed=1))["spo"]
+    assert ">not decided<" in shown(cell("ppo", BASE[1:], failed=1), cell("spo", BASE))["spo"]
+
+
+def test_a_rule_that_drops_next_to_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = cell("ppo", BASE)
+    idle, active = (cell("sauna", BASE + 50, keep_rate=rate) for rate in (0.9964, 0.98))
+    assert shown(base, idle)["sauna"].endswith("<br>drops 0.36%")
+    assert "drops" not in shown(base, active)["sauna"]
+    assert "drops" not in shown(base, cell("spo", BASE, sample_rate=1.0))["spo"]
+    assert "drops" not in shown(base, cell("gigaflow", BASE))["gigaflow"]  # not recorded then
+    results = study(base, idle)
+    text = arms("A-v5", results, summarize(results))
+    assert "`sauna` left out 0.36% of its samples. No difference can be credited" in text
+    monkeypatch.setattr(selection_page, "load", {selection_page.SCREENS[0]: results}.get)
+    assert "no rule beats `ppo`" in (selection_page.screen_answer() or "")
+
+
+def test_one_training_under_two_names_is_said() -> None:
+    one, two = cell("pods+random", BASE + 1), cell("gigaflow+random", BASE + 1)
+    cells = [cell("ppo", BASE), one, two]
+    assert shown(*cells)["gigaflow+random"].endswith("<br>same training as `pods+random`")
+    assert "same training" not in shown(*cells)["pods+random"]
+    text = arms("A-v5", study(*cells), summarize(study(*cells)))
+    assert "`gigaflow+random` is the same training as `pods+random`" in text
+    two["members"][3]["auc"] += 1e-9
+    assert "same training" not in shown(*cells)["gigaflow+random"]
+    lost = [cell(f"{name}+random", BASE[:0], failed=5) for name in ("pods", "gigaflow")]
+    assert "same training" not in "".join(shown(cells[0], *lost).values())
+
+
+def test_seeds_on_which_a_rule_did_nothing_are_counted() -> None:
+    returns = BASE + np.array([0, 0, 0, 1, 0])
+    stop = cell("target-kl", returns)
+    stop["members"][4]["env_steps"] += 1
+    cells = [cell("ppo", BASE), stop]
+    assert shown(*cells)["target-kl"].endswith("<br>is `ppo` in 3 of 5 seeds")
+    text = arms("A-v5", study(*cells), summarize(study(*cells)))
+    assert "AUC and the env steps of `ppo` in 3 of 5 seeds. There the rule changed nothing" in text
+    assert "is `ppo`" not in shown(cells[0], cell("spo", BASE + 1))["spo"]
+
+
+def test_compute_is_counted_in_seconds_and_gradient_steps_where_they_are_known() -> None:
+    cells = [
+        cell("ppo", BASE, learner_cpu_seconds=10.0, gradient_steps=100.0),
+        cell("recompute", BASE, learner_cpu_seconds=16.2, gradient_steps=50.0),
+        cell("spo", BASE),  # of before
+    ]
+    text = arms("A-v5", study(*cells), summarize(study(*cells)))
+    assert "| CPU seconds of the learner | Gradient steps |" in text
+    assert "] | 1.62 of PPO's | 0.50 of PPO's |" in text
+    assert "] | - | - |" in text
+    former = study(cells[2], cell("ppo", BASE))
+    text = arms("A-v5", former, summarize(former))
+    assert "CPU seconds" not in text and "Gradient steps" not in text
+
+
+def test_the_page_says_what_a_ratio_divides_by() -> None:
+    """PPO rises to its last return within the first half of its samples."""
+    early = cell("ppo", BASE)
+    for member in early["members"]:
+        curve, final = member["curve"], member["final_return"]
+        curve["return_mean"] = [min(2 * y, final) for y in curve["return_mean"]]
+    assert share_to_level(early) == pytest.approx(0.5)
+    assert share_to_level(cell("ppo", BASE)) == pytest.approx(1.0)
+    assert share_to_level(cell("ppo", BASE, failed=1)) is None
+    text = arms("A-v5", study(early), summarize(study(early)))
+    assert "`ppo` takes 0.50 of its own samples until its mean curve first reaches" in text
+
+
+def test_an_end_that_is_not_one_half_does_not_look_like_it() -> None:
+    assert [shown_chance(x) for x in (0.5, 0.4949, 0.4951, 0.50004)] == [
+        "0.50",
+        "0.49",
+        "0.495",
+        "0.50004",
+    ]
+    assert shown_improvement([0.1, 0.012, 0.4964]) == "0.10 [0.01, 0.496]"
+    assert shown_improvement([0.6, None, None]) == "0.60"
+    assert shown_improvement(None) == shown_improvement([None] * 3) == "-"
+
+
+def test_the_seeds_are_counted_and_not_told() -> None:
+    arms_of = [cell("ppo", BASE), cell("spo", BASE[:2], failed=1)]
+    assert seeds_said(arms_of[:1]) == "5 seeds"
+    assert seeds_said(arms_of) == "3 to 5 seeds"
+    assert seeds_said([cell("ppo", BASE[:1])]) == "1 seed"
+    assert seeds_said([]) == "no seeds"
+
+
+def test_the_whole_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = study(cell("ppo", BASE), cell("gigaflow", BASE + 50), cell("gigaflow+random", BASE))
+    found = {"selection-screen-cartpole": results, "selection-pilot-hopper": None}
+    monkeypatch.setattr(selection_page, "load", found.get)
+    text = selection_page.selection_page()
+    assert text is not None
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert headings[1:] == [
+        "## The screen: rule by task",
+        "## What the tests decide",
+        "## Standing after the screen so far",
+        "## Every arm, task by task",
+    ]
+    assert "5 seeds of each arm." in text and "A curve has 20 points" in text
+    assert "The stage has 295 tests" in text  # 27 arms and 10 pairs on 8 tasks; one is ppo's

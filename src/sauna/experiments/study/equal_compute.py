@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,11 @@ ABOUT = (
     "in CPU seconds of the learner, and in CPU seconds of the training, which are those of "
     "collecting as well. On the device the two are one program. The interval is a percentile "
     "bootstrap over seeds, too narrow with few of them; no verdict rests on it. There is no ratio "
-    "if the baseline has one seed, or if its return has not risen by more than its noise. "
+    "if the baseline has one seed, if one of its seeds failed, or if its return has not risen by "
+    "more than its noise. An arm of which a seed failed does not reach the baseline's return. "
     "CPU seconds leave out the compilation of a run's first iteration, but not of a resumed one."
 )
+NEVER = Ratio(None, None, None)
 WORDS = {
     "samples_backward": "in samples",
     "learner_cpu_seconds": "in CPU seconds of the learner",
@@ -54,24 +56,37 @@ def by_compute(cells: Sequence[Cell]) -> dict[str, dict[str, Any]]:
 def compute_verdicts(cells: Sequence[Cell]) -> list[dict[str, Any]]:
     """Says for each arm with how much of its baseline's compute it reaches the same return.
 
-    A baseline that has not risen above its start has a row of its own, in place of its arms.
+    A baseline that gives no level, because a seed failed or it has not risen above its start, has a
+    row of its own, in place of its arms.
     """
     of_label = {cell.label: cell for cell in cells}
     found = {}
     for cell in cells:
         base = of_label.get(cell.baseline or "")
-        if base is None:
+        levels = _levels(base) if base else {}
+        if base is None or not levels:
             continue
-        known = [(axis, curves_over(cell, axis), curves_over(base, axis)) for axis in AXES]
-        pairs = {axis: (own, other) for axis, own, other in known if own and other}
-        if not pairs:
-            continue
-        if not all(has_risen(other) for _, other in pairs.values()):
-            found[base.label] = _verdict(base, base, {}, _flat(base))
-            continue
-        ratios = {axis: compute_ratio(*pair) for axis, pair in pairs.items()}
-        found[cell.label] = _verdict(cell, base, ratios, _text(cell, base, ratios))
+        if base.failed or not all(map(has_risen, levels.values())):
+            found[base.label] = _verdict(base, base, {}, _without_level(base))
+        elif ratios := _ratios(cell, levels):
+            found[cell.label] = _verdict(cell, base, ratios, _text(cell, base, ratios))
     return [*found.values()]
+
+
+def _levels(base: Cell) -> dict[str, Curves]:
+    known = {axis: curves_over(base, axis) for axis in AXES}
+    return {axis: curves for axis, curves in known.items() if curves}
+
+
+def _ratios(cell: Cell, levels: Mapping[str, Curves]) -> dict[str, Ratio]:
+    """Computes the ratio in each kind of compute that both arms know.
+
+    A failed seed is the worst outcome, so that the mean with it never reaches a level.
+    """
+    if cell.failed:
+        return dict.fromkeys(levels, NEVER)
+    known = {axis: (curves_over(cell, axis), base) for axis, base in levels.items()}
+    return {axis: compute_ratio(own, base) for axis, (own, base) in known.items() if own}
 
 
 def _verdict(cell: Cell, base: Cell, ratios: dict[str, Ratio], text: str) -> dict[str, Any]:
@@ -84,17 +99,26 @@ def _verdict(cell: Cell, base: Cell, ratios: dict[str, Ratio], text: str) -> dic
     }
 
 
-def _flat(base: Cell) -> str:
+def _without_level(base: Cell) -> str:
+    if base.failed:
+        return (
+            f"{base.label}: {_failed(base)} on {base.task}, so no ratio of compute is given to "
+            "reach its return."
+        )
     return (
         f"{base.label}: its return on {base.task} has not risen above its start by more than its "
         "noise, so no ratio of compute is given."
     )
 
 
+def _failed(cell: Cell) -> str:
+    return f"{cell.failed} of {cell.failed + len(cell.complete)} seeds failed"
+
+
 def _text(cell: Cell, base: Cell, ratios: dict[str, Ratio]) -> str:
     goal = f"{base.label}'s final return on {cell.task}"
-    if all(ratio == (None, None, None) for ratio in ratios.values()):
-        return f"{cell.label}: does not reach {goal}."
+    if all(ratio == NEVER for ratio in ratios.values()):
+        return f"{cell.label}: does not reach {goal}{f', as {_failed(cell)}' * bool(cell.failed)}."
     said = "; ".join(f"{WORDS[axis]} {_share(ratio)}" for axis, ratio in ratios.items())
     if any(None in ratio for ratio in ratios.values()):
         return f"{cell.label}: not decided with how much compute it reaches {goal}: {said}."
