@@ -78,7 +78,7 @@ WHY = {
     "one of them alone gets 4 of 16 by chance.",
     "pong": "One seed is no comparison. It shows how far a million env steps go on Atari.",
     "late-collapse": "Some seeds of PPO lose late what they had learned. Do they update too often? "
-    "`target-kl` ends an update early, and one arm takes half of the epochs.",
+    "`target-kl` ends an update early (limit 0.01), and one arm takes half of the epochs.",
     "vex-head": "The head helped on two tasks with six seeds, undecided. Thirty seeds that no "
     "other study used decide it.",
     "noise": "The paper says that the dropped samples are noisy. The policy gradient of dropped "

@@ -173,12 +173,19 @@ def _ended(
         "kept_steps": kept,
         "keep_rate": kept / tried if kept is not None and tried else None,
         "sample_rate": _short(_mean([row["sample_rate"] for row in rows if "sample_rate" in row])),
+        "gradient_steps": _sum(row["gradient_steps"] for row in rows if "gradient_steps" in row),
         "episodes": last.get("episodes"),
         "explained_variance": last.get("explained_variance"),
         **{name: _short(values[-1]) for name, values in compute.items()},
         **evaluated(rows, POINTS, DIGITS),
         "curve": _curve(rows, compute),
     }
+
+
+def _sum(numbers: Iterable[int]) -> int | None:
+    """Returns the sum; None of nothing."""
+    known = list(numbers)
+    return sum(known) if known else None
 
 
 def _compute(
