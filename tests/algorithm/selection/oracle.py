@@ -99,12 +99,13 @@ def prioritized_probabilities(advantage: Array, power: float = 0.8, floor: float
     return scaled / scaled.sum()
 
 
-def prioritized_weights(probability: Array, correction: float, over: Array | None = None) -> Array:
-    """Weakens what is drawn often: `(N p)^-correction`, divided by its maximum over the rows `over`
-    (all rows if None). At `correction = 1` proportional to the unbiased weight."""
+def prioritized_weights(probability: Array, correction: float) -> Array:
+    """Weakens what is drawn often: `(N p)^-correction`, divided by its mean over draws.
+
+    At `correction = 1` that is the unbiased weight."""
     (p,) = floats(probability)
     weight = (len(p) * p) ** -correction
-    return weight / (weight if over is None else weight[np.asarray(over)]).max()
+    return weight / np.average(weight, weights=p)
 
 
 def positive_advantage(advantage: Array, epsilon: float = 1e-8) -> Array:
