@@ -279,6 +279,24 @@ def vex_keep(share: Array, kept: float, which: Literal["high", "low", "both"]) -
     return top | largest(np.where(top, -np.inf, -share), count - high)
 
 
+def informative_keep(share: Array, threshold: float = 0.3, present: Array | None = None) -> Array:
+    """Keeps what passes eq. 7 in each column of `[T, N]`, of rows in time order.
+
+    `|x| / (|median of the earlier rows' x| + 1e-8) >= threshold`; a first row has no earlier ones
+    and is kept. Rows that are not `present` are neither kept nor among the earlier ones.
+    """
+    (share,) = floats(share)
+    there = np.ones(share.shape, bool) if present is None else np.asarray(present, bool)
+    keep = np.zeros(share.shape, bool)
+    for n, column in enumerate(share.T):
+        earlier: list[float] = []
+        for t in np.flatnonzero(there[:, n]):
+            ratio = abs(column[t]) / (abs(np.median(earlier)) + 1e-8) if earlier else np.inf
+            keep[t, n] = ratio >= threshold
+            earlier.append(column[t])
+    return keep
+
+
 # ------------------------------------------------------------------ controls and minibatches
 
 

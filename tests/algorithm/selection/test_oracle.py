@@ -311,6 +311,15 @@ def test_vex_by_hand() -> None:
     np.testing.assert_array_equal(o.vex_share(np.ones(2), np.ones(2)), [0, 0])
 
 
+def test_eq_7_by_hand() -> None:
+    """Medians of the earlier rows: none, 1, 0.6, 0.2, 0.1; a very negative share is kept."""
+    share = np.array([[1.0], [0.2], [0.1], [-4.0], [0.04]])
+    assert o.informative_keep(share)[:, 0].tolist() == [True, False, False, True, False]
+    assert o.informative_keep(share, 0.1)[:, 0].tolist() == [True, True, True, True, True]
+    there = np.array([[True], [False], [True], [True], [True]])  # medians: none, 1, 0.55, 0.1
+    assert o.informative_keep(share, 0.3, there)[:, 0].tolist() == [True, False, False, True, True]
+
+
 # ------------------------------------------------------------------ controls and minibatches
 
 
