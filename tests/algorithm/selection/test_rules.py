@@ -318,6 +318,23 @@ def test_a_share_of_the_others_leaks() -> None:
     np.testing.assert_array_equal(everything, s.present)
 
 
+def test_segments_are_no_longer_than_the_rollout() -> None:
+    """So that half of a short rollout's rows is a share of a half, not of all rows.
+
+    CartPole's preset has 8 envs of 32 steps. An epoch draws `share M` rows: with a share of 1 it
+    goes through the kept half twice.
+    """
+    setup = SETUP._replace(rollout_steps=32, envs=8)
+    short = pods(setup)
+    assert short.share == 0.5
+    s = random_samples(0, rows=256, absent=0.0)
+    keep = chosen(short, s).keep
+    assert keep.sum() == 128 and (keep.reshape(32, 8).sum(0) % 32 == 0).all()
+    np.testing.assert_array_equal(keep, chosen(pods(setup, length=32), s).keep)
+    assert pods(setup._replace(rollout_steps=128)).share == 0.5
+    assert pods(setup._replace(rollout_steps=65, envs=1)).share == 64 / 65
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_other_set_of_segments_varies_more(seed: int) -> None:
     score = np.random.default_rng(seed).normal(size=8).astype(np.float32)
