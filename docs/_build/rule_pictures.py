@@ -169,13 +169,19 @@ def critics(axes: Any) -> None:
 def vex(axes: Any) -> None:
     """Each step's share of the explained variance against its error, and who is kept."""
     samples = rollout()
+    samples = samples._replace(advantage=samples.error)  # of one step, as with lambda 0
     error = np.asarray(samples.error)
     share = 1 - error**2 / np.asarray(samples.return_).var()
-    for ax, which in zip(axes, ("high", "low", "both"), strict=True):
-        keep = asked("vex-oracle", samples, keep=which).keep
+    settings: dict[str, dict[str, Any]] = {
+        "threshold 0.8": {"threshold": 0.8},
+        "keep high": {"keep": "high"},
+        "keep low": {"keep": "low"},
+    }
+    for ax, (title, chosen) in zip(axes, settings.items(), strict=True):
+        keep = asked("vex-oracle", samples, **chosen).keep
         ax.plot(error[~keep], share[~keep], ".", ms=2.5, color=GREY, label="left out")
         ax.plot(error[keep], share[keep], ".", ms=2.5, color=BLUE, label="taken")
-        ax.set(title=f"keep {which}", xlabel="R - V", xlim=(-3, 3), ylim=(-2, 1.1))
+        ax.set(title=f"{title}: {keep.mean():.0%}", xlabel="R - V", xlim=(-3, 3), ylim=(-2, 1.1))
     axes[0].set_ylabel("share of explained variance")
     axes[0].legend()
 

@@ -416,6 +416,7 @@ MUTANTS = [
         "algorithm/selection/test_rules",
         ("corrected the other way", "** -b, 0.0)", "** b, 0.0)"),
         ("correction does not rise", "(1.0 - correction) * progress", "0.0 * progress"),
+        ("divided by the largest weight", "jnp.sum(p * weight)", "jnp.max(weight)"),
     ),
     *_of(
         "algorithm/selection/gradient_norm.py",

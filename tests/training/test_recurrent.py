@@ -69,7 +69,7 @@ def test_every_rule_trains_a_recurrent_policy(arm: str, place: str, cell: str) -
     for row in recorder.rows:
         assert 0 < row["gradient_steps"] <= 8 and 0 <= row["sample_rate"] <= 1
         assert all(np.isfinite(x) for x in row.values() if isinstance(x, float))
-    shares = {"top-advantage": 0.5, "kondo": 0.3, "vex-oracle": 0.5}
+    shares = {"top-advantage": 0.5, "kondo": 0.3}
     if arm in shares:
         expected = np.ceil(shares[arm] * 64) / 64
         np.testing.assert_allclose([row["sample_rate"] for row in recorder.rows], expected)

@@ -54,7 +54,7 @@ def test_an_arm_trains_and_its_work_is_told(arm: str, place: str) -> None:
         assert all(np.isfinite(x) for x in row.values() if isinstance(x, float))
     final = recorder.final
     assert all(np.isfinite(x).all() for name, x in final.items() if "/params/" in name)
-    shares = {"top-advantage": 0.5, "kondo": 0.3, "vex-oracle": 0.5}
+    shares = {"top-advantage": 0.5, "kondo": 0.3}
     for name, share in shares.items():
         if arm == name:
             expected = np.ceil(share * 64) / 64

@@ -237,6 +237,8 @@ class Sampler(NamedTuple):
       share: static, the most that a choice takes: arrays have `K = ceil(share * M)` rows.
       reads_policy: whether `samples` hold those of today's policy, which takes one forward pass.
       each_epoch: choose before each epoch instead of once per iteration.
+      on_mean: for a Gaussian policy, a mask chooses whom the mean learns from, and the log-std
+        learns from all rows; read with `selection_losses=policy`.
     """
 
     init: Callable[[], Any]
@@ -244,6 +246,7 @@ class Sampler(NamedTuple):
     share: float = 1.0
     reads_policy: bool = False
     each_epoch: bool = False
+    on_mean: bool = False
 
 
 class LossTerms(NamedTuple):

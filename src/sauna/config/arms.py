@@ -74,7 +74,7 @@ ARM_HELP = {
     "avec": "critic: fit the variance of the error instead of its square",
     "merl": "critic: heads for the explained variance and the next observation are trained along",
     "pods": "rollout: the half of the 64-step segments whose advantages vary most",
-    "vex-oracle": "rollout: keep where SAUNA's quantity, known afterwards, is high",
+    "vex-oracle": "rollout: SAUNA's test (eq. 7) on its quantity known afterwards",
 }
 STAGES = ("collect", "rollout", "epoch", "loss", "stop", "critic")
 # What `sauna list rules` shows: `stage: sentence`.
@@ -89,7 +89,6 @@ SHARES = {
     "gradient-norm": 1.0,
     "kondo": 0.3,
     "pods": 0.5,
-    "vex-oracle": 0.5,
 }
 CONTROL_HELP = {
     "random": "control: as many samples as the rule takes in each iteration, at random",

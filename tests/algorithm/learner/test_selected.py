@@ -19,12 +19,13 @@ from sauna.algorithm.learner.learn import learn
 from sauna.algorithm.learner.losses import Losses, Minibatch
 from sauna.algorithm.learner.metrics import UpdateMetrics
 from sauna.algorithm.learner.samples import recomputed
-from sauna.algorithm.learner.selected import minibatch
+from sauna.algorithm.learner.selected import choose, minibatch
 from sauna.algorithm.learner.update import (
     Parts,
     gradient_step,
     init_state,
     loss_advantage,
+    minibatch_losses,
     plain_minibatch,
     update_on_all,
 )
@@ -35,6 +36,7 @@ from sauna.algorithm.selection.control import controlled
 from sauna.algorithm.selection.delight import delight
 from sauna.algorithm.selection.gigaflow import gigaflow
 from sauna.algorithm.selection.gradient_norm import gradient_norm
+from sauna.algorithm.selection.kondo import kondo
 from sauna.algorithm.selection.registry import Rules
 from sauna.algorithm.types import (
     Batch,
@@ -385,6 +387,48 @@ def test_delight_on_the_mean_leaves_the_log_std_its_gradient(on: Any) -> None:
     without = gradient_of(None)
     same = np.allclose(gradient[:, 2:], without[:, 2:], rtol=1e-4, atol=1e-5)
     assert same is (on == "mean") and not np.allclose(gradient[:, :2], without[:, :2], rtol=1e-2)
+
+
+def test_kondos_choice_of_noise_does_not_widen_a_gaussian() -> None:
+    """Advantages that know nothing of the actions move the log-std as they do without a rule.
+
+    The negative control lets the log-std learn from the kept rows, too: they widen the policy. The
+    mean learns from the kept rows in both forms, and from other rows under the matched control.
+    """
+    count, settings = 2048, {"selection_losses": "policy", "normalize_over": "rollout"}
+    config: Config = dataclasses.replace(CONFIG, rollout_steps=count, envs=1, **settings)
+    policy = make_policy(config, SPACES._replace(action_sizes=(3,)))
+    params, rng = policy.init(jax.random.key(0)), np.random.default_rng(0)
+    seen, noise = (jnp.asarray(rng.normal(size=(count, n)), jnp.float32) for n in (2, 3))
+    output, zero = policy.apply(params, seen), jnp.zeros(count)
+    action = policy.distribution.sample(output.policy, noise)
+    batch = Batch(seen, action, *[zero] * 5, zero + 1)._replace(
+        log_prob=policy.distribution.log_prob(output.policy, action),
+        advantage=jnp.asarray(oracle.standardise(rng.normal(size=count)), jnp.float32),
+    )
+    rows = jnp.arange(count, dtype=jnp.int32)
+
+    def ascent(sampler: Sampler | None) -> tuple[Any, Any]:
+        """The policy objective's gradient on the log-std, and on everything else."""
+        parts = parts_of(config, policy, sampler=sampler)
+        state, h, rollout = TrainState(params, ()), floats(hypers()), floats(random_rollout(0))
+        choice = choose(state, batch, rollout, no_key(), parts=parts)[1]
+        drawn = Draw(rows, rows, jnp.int32(count))
+        part = minibatch(batch, choice, drawn, rows, rows >= 0, parts=parts)
+        loss = lambda x: -minibatch_losses(x, part, h, parts=parts).policy_loss  # noqa: E731
+        gradient = dict(policy.unravel(jax.jit(jax.grad(loss))(params))["params"])
+        log_std = gradient.pop("log_std")
+        return log_std, np.concatenate([x.ravel() for x in jax.tree.leaves(gradient)])
+
+    setup = SamplerSetup(count, 1, 5, "continuous", (3,))
+    rules = (None, kondo(setup), kondo(setup, on="all"), controlled("random", kondo(setup)))
+    plain, kept, whole, random = map(ascent, rules)
+    for log_std, _ in (kept, random):
+        np.testing.assert_allclose(log_std, plain[0], rtol=1e-4, atol=1e-5)
+    assert abs(np.sum(kept[0])) < 0.15 and np.sum(whole[0]) > 1.5
+    np.testing.assert_allclose(kept[1], whole[1], rtol=1e-3, atol=1e-5)
+    for _, other in (plain, random):
+        assert not np.allclose(kept[1], other, rtol=0.1, atol=1e-3)
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "a2c"])

@@ -29,7 +29,8 @@ from sauna.algorithm.learner.sequences import (
 )
 from sauna.algorithm.learner.update import minibatch_losses
 from sauna.algorithm.policy.policy import make_policy
-from sauna.algorithm.types import Batch, Choice, Draw, Memory, Rollout
+from sauna.algorithm.selection.registry import Rules
+from sauna.algorithm.types import Batch, Choice, Draw, Memory, Rollout, Sampler
 from sauna.envs.spaces import Spaces
 
 LENGTH, STEPS, ENVS = 4, 8, 2
@@ -127,6 +128,26 @@ def test_a_dropped_row_counts_for_nothing_but_the_memory() -> None:
     assert float(total(rollout._replace(observation=seen), batch)) != pytest.approx(plain, rel=1e-6)
     kept = batch._replace(advantage=jnp.where(dropped, batch.advantage, 50.0))
     assert float(total(rollout, kept)) != pytest.approx(plain, rel=1e-3)
+
+
+@pytest.mark.parametrize("on_mean", [True, False])
+def test_a_choice_for_the_mean_masks_no_row_of_a_sequence(on_mean: bool) -> None:
+    """Each kept row's gradient of the mean is multiplied by rows / kept rows, the others' by 0."""
+    parts, rollout, batch, _ = setup(arm="kondo")
+    nothing: Any = None
+    parts = parts._replace(rules=Rules(Sampler(nothing, nothing, on_mean=on_mean)))
+    keep = np.arange(STEPS * ENVS) % 4 == 0
+    choice = Choice(keep=jnp.asarray(keep))
+    make = minibatches_of_sequences(batch, choice, everything(), rollout, None, parts=parts)
+    part = make(*ALL)
+    rows = cut(np.arange(STEPS * ENVS).reshape(STEPS, ENVS), LENGTH).ravel()
+    kept = np.zeros(STEPS * ENVS)
+    kept[np.asarray(batch.row)[keep]] = 1.0
+    np.testing.assert_array_equal(part.policy_mask, 1.0 if on_mean else kept[rows])
+    if on_mean:
+        np.testing.assert_allclose(part.mean_scale, 4.0 * kept[rows])
+    else:
+        assert part.mean_scale is None
 
 
 def test_a_sequence_without_a_kept_row_is_left_out() -> None:

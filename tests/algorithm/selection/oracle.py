@@ -99,12 +99,13 @@ def prioritized_probabilities(advantage: Array, power: float = 0.8, floor: float
     return scaled / scaled.sum()
 
 
-def prioritized_weights(probability: Array, correction: float, over: Array | None = None) -> Array:
-    """Weakens what is drawn often: `(N p)^-correction`, divided by its maximum over the rows `over`
-    (all rows if None). At `correction = 1` proportional to the unbiased weight."""
+def prioritized_weights(probability: Array, correction: float) -> Array:
+    """Weakens what is drawn often: `(N p)^-correction`, divided by its mean over draws.
+
+    At `correction = 1` that is the unbiased weight."""
     (p,) = floats(probability)
     weight = (len(p) * p) ** -correction
-    return weight / (weight if over is None else weight[np.asarray(over)]).max()
+    return weight / np.average(weight, weights=p)
 
 
 def positive_advantage(advantage: Array, epsilon: float = 1e-8) -> Array:
@@ -276,6 +277,24 @@ def vex_keep(share: Array, kept: float, which: Literal["high", "low", "both"]) -
     high = {"high": count, "low": 0, "both": (count + 1) // 2}[which]
     top = largest(share, high)
     return top | largest(np.where(top, -np.inf, -share), count - high)
+
+
+def informative_keep(share: Array, threshold: float = 0.3, present: Array | None = None) -> Array:
+    """Keeps what passes eq. 7 in each column of `[T, N]`, of rows in time order.
+
+    `|x| / (|median of the earlier rows' x| + 1e-8) >= threshold`; a first row has no earlier ones
+    and is kept. Rows that are not `present` are neither kept nor among the earlier ones.
+    """
+    (share,) = floats(share)
+    there = np.ones(share.shape, bool) if present is None else np.asarray(present, bool)
+    keep = np.zeros(share.shape, bool)
+    for n, column in enumerate(share.T):
+        earlier: list[float] = []
+        for t in np.flatnonzero(there[:, n]):
+            ratio = abs(column[t]) / (abs(np.median(earlier)) + 1e-8) if earlier else np.inf
+            keep[t, n] = ratio >= threshold
+            earlier.append(column[t])
+    return keep
 
 
 # ------------------------------------------------------------------ controls and minibatches

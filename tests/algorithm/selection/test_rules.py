@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 
 from algorithm.selection import oracle
+from arrays import hypers, no_key, unscored
+from helpers import configured
+from sauna.algorithm.learner.vex_targets import TARGETS
 from sauna.algorithm.policy.bounded import beta, squashed
 from sauna.algorithm.policy.distributions import bernoulli, gaussian, multi_categorical
+from sauna.algorithm.selection.control import controlled
 from sauna.algorithm.selection.gigaflow import gigaflow
 from sauna.algorithm.selection.gradient_norm import gradient_norm, head_gradient
 from sauna.algorithm.selection.kondo import kondo
@@ -21,6 +25,7 @@ from sauna.algorithm.selection.positive import cut_at_zero, positive
 from sauna.algorithm.selection.prioritized import prioritized
 from sauna.algorithm.selection.scores import count_of
 from sauna.algorithm.selection.top_advantage import top_advantage
+from sauna.algorithm.selection.vex_filter import sauna_per_env
 from sauna.algorithm.selection.vex_oracle import vex_oracle
 from sauna.algorithm.types import Sampler, Samples
 from selections import (
@@ -67,9 +72,20 @@ def expected_pods(s: Samples) -> Found:
 
 
 def expected_vex(s: Samples, which: Any = "high") -> Found:
-    share = oracle.vex_share(*of_present(s, "error", "return_"))
+    advantage, value = of_present(s, "advantage", "value")
+    share = oracle.vex_share(advantage, value + advantage)
     count = oracle.kept_count(0.5, ROWS)
     return {"keep": spread(s, oracle.vex_keep(share, count / len(share), which))}
+
+
+def expected_informative(s: Samples, threshold: float = 0.3) -> Found:
+    """Each env by itself, its returns' variance, too."""
+    columns = [np.asarray(x).reshape(STEPS, ENVS) for x in (s.advantage, s.value, s.present)]
+    share = np.zeros((STEPS, ENVS))
+    for n, (advantage, value, on) in enumerate(zip(*(x.T for x in columns), strict=True)):
+        share[on, n] = oracle.vex_share(advantage[on], (value + advantage)[on])
+    keep = oracle.informative_keep(np.maximum(share, -5.0), threshold, columns[2])
+    return {"keep": keep.ravel()}
 
 
 def expected_prioritized(s: Samples, correction: float = 0.2) -> Found:
@@ -133,7 +149,8 @@ CASES = {
     "top-advantage": Case(top_advantage, expected_top, {"share": 0.6}, {"leak": 0.5}),
     "kondo": Case(kondo, expected_kondo, {"share": 0.35}, {"centred": False}),
     "pods": Case(pods, expected_pods, {"share": 0.4}, {"length": 5}, length=6),
-    "vex-high": Case(vex_oracle, expected_vex, {"share": 0.4}, {"keep": "low"}),
+    "vex": Case(vex_oracle, expected_informative, {"threshold": 0.5}, {"share": 0.8}),
+    "vex-high": Case(vex_oracle, expected_vex, {"share": 0.4}, {"keep": "low"}, share=0.5),
     "vex-low": Case(vex_oracle, lambda s: expected_vex(s, "low"), {"keep": "both"}, keep="low"),
     "vex-both": Case(vex_oracle, lambda s: expected_vex(s, "both"), {"keep": "high"}, keep="both"),
     "prioritized": Case(prioritized, expected_prioritized, {"power": 0.7}, {"correction": 0.3}),
@@ -202,11 +219,89 @@ def test_the_correction_rises_to_one_over_the_budget() -> None:
     assert not np.allclose(choice.weight, expected_prioritized(s, 0.9)["weight"], rtol=1e-3)
 
 
+@pytest.mark.parametrize("tail", [1, 3])
+def test_prioritized_leaves_the_policy_loss_its_size(tail: int) -> None:
+    """The mean weight of a drawn term is 1, PPO's, at every time and however many rows there are.
+
+    Divided by the largest weight, which is that of the row of |A| nearest 0, it is below 0.01 at
+    the end of a budget.
+    """
+    rows = 8192
+    setup = SETUP._replace(rollout_steps=rows, envs=1)
+    s = random_samples(4, rows=rows, absent=0.1)
+    s = s._replace(advantage=jnp.cbrt(s.advantage) ** tail)
+    for count in range(SETUP.iterations):
+        choice = chosen(prioritized(setup), s, jnp.int32(count))
+        mean = np.sum(choice.probability.astype(float) * choice.weight)
+        assert mean == pytest.approx(1.0, rel=1e-4)
+    assert mean / choice.weight.max() < 0.01
+
+
 def test_where_scores_tie_the_lower_rows_are_kept() -> None:
     s = random_samples(0, absent=0.0)
     s = s._replace(advantage=jnp.asarray(np.arange(ROWS) % 3, jnp.float32))
     keep = chosen(top_advantage(SETUP, share=0.5), s).keep
     np.testing.assert_array_equal(keep, oracle.top_advantage_keep(s.advantage, 0.5))
+
+
+@pytest.mark.parametrize("threshold", [None, 0.8])
+def test_the_oracle_is_saunas_filter_that_predicts_its_target(threshold: Any) -> None:
+    """Arm `sauna`'s own filter keeps the same steps if its head gives the head's target itself."""
+    given = {} if threshold is None else {"threshold": threshold}
+    limit = configured(arm="sauna", **given).threshold
+    for seed in SEEDS:
+        s = random_samples(seed, absent=0.0)
+        s = s._replace(advantage=3.0 * s.advantage)  # some shares are below -5
+        value, advantage = (x.reshape(STEPS, ENVS) for x in (s.value, s.advantage))
+        ones = jnp.ones((STEPS, ENVS))
+        target = TARGETS["sample"].target(value + advantage, value, ones, 0 * ones)
+        rule = sauna_per_env("all", STEPS)
+        state, keep = rule.init(ENVS, STEPS), []
+        h = hypers(threshold=limit)
+        for vex in target:
+            state, kept = rule.keep(state, unscored(s.observation[:ENVS], vex), no_key(), h)
+            keep.append(kept)
+        got = chosen(vex_oracle(SETUP, **given), s).keep
+        np.testing.assert_array_equal(got, np.stack(keep).ravel())
+        assert not got.all()
+        assert not np.array_equal(got, chosen(vex_oracle(SETUP, threshold=limit + 0.2), s).keep)
+
+
+def test_ranks_of_the_oracle_are_ranks_by_the_advantage() -> None:
+    """So that `high` and `low` are no tests of SAUNA's idea, and its own test is another set."""
+    s = random_samples(0)
+    top = top_advantage(SETUP)
+    low = chosen(controlled("low-advantage", top), s).keep
+    np.testing.assert_array_equal(chosen(vex_oracle(SETUP, keep="high"), s).keep, low)
+    np.testing.assert_array_equal(
+        chosen(vex_oracle(SETUP, keep="low"), s).keep, chosen(top, s).keep
+    )
+    own = chosen(vex_oracle(SETUP), s).keep
+    assert (own & ~low).any() and (own & low).any() and own.sum() > low.sum()
+
+
+@pytest.mark.parametrize("numbers", [{}, {"share": 0.3333}])
+def test_the_oracle_does_not_prefer_replayed_rows_of_another_policy(numbers: Any) -> None:
+    """A truncated ratio of 0.01 leaves `R - V` next to nothing: scored by that, old rows would be
+    kept first."""
+    setup, count = SETUP._replace(rollout_steps=400, replay_rollouts=1), 2400
+    s = random_samples(6, rows=count, absent=0.0)
+    rho = jnp.where(jnp.arange(count) < 1200, 1.0, 0.01)
+    s = s._replace(error=rho * s.advantage, return_=s.value + rho * s.advantage)
+    new, old = chosen(vex_oracle(setup, **numbers), s).keep.reshape(2, -1).mean(1)
+    assert abs(new - old) < 0.08
+    by_error = oracle.vex_share(np.asarray(s.error), np.asarray(s.return_))
+    new, old = oracle.vex_keep(by_error, 0.3333, "high").reshape(2, -1).mean(1)
+    assert old - new > 0.3
+
+
+def test_each_replayed_rollout_has_its_own_history() -> None:
+    setup = SETUP._replace(replay_rollouts=1)
+    s = random_samples(7, rows=2 * ROWS)
+    both = chosen(vex_oracle(setup), s).keep.reshape(2, -1)
+    for i, keep in enumerate(both):
+        one = jax.tree.map(lambda x, i=i: x[i * ROWS : (i + 1) * ROWS], s)
+        np.testing.assert_array_equal(keep, chosen(vex_oracle(SETUP), one).keep)
 
 
 def test_a_share_of_the_others_leaks() -> None:
@@ -221,6 +316,23 @@ def test_a_share_of_the_others_leaks() -> None:
     assert abs(leaked[others].sum() - 0.3 * number) < 5 * np.sqrt(number * 0.3 * 0.7)
     everything = chosen(top_advantage(setup, share=0.25, leak=1.0), s).keep
     np.testing.assert_array_equal(everything, s.present)
+
+
+def test_segments_are_no_longer_than_the_rollout() -> None:
+    """So that half of a short rollout's rows is a share of a half, not of all rows.
+
+    CartPole's preset has 8 envs of 32 steps. An epoch draws `share M` rows: with a share of 1 it
+    goes through the kept half twice.
+    """
+    setup = SETUP._replace(rollout_steps=32, envs=8)
+    short = pods(setup)
+    assert short.share == 0.5
+    s = random_samples(0, rows=256, absent=0.0)
+    keep = chosen(short, s).keep
+    assert keep.sum() == 128 and (keep.reshape(32, 8).sum(0) % 32 == 0).all()
+    np.testing.assert_array_equal(keep, chosen(pods(setup, length=32), s).keep)
+    assert pods(setup._replace(rollout_steps=128)).share == 0.5
+    assert pods(setup._replace(rollout_steps=65, envs=1)).share == 64 / 65
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -280,7 +392,7 @@ def test_the_bound_is_the_gradients_norm_at_the_head(kind, sizes, distribution) 
 def test_weights_of_a_draw_undo_its_probabilities(rule: Callable[..., Sampler]) -> None:
     """Summed over every row that can be drawn, the weighted mean is the mean of all rows.
 
-    At the end of the budget prioritized is proportional to that; before it is not.
+    With prioritized that is so at the end of the budget.
     """
     s, state = random_samples(5), None
     term = np.random.default_rng(0).normal(size=ROWS)
@@ -288,14 +400,12 @@ def test_weights_of_a_draw_undo_its_probabilities(rule: Callable[..., Sampler]) 
     if rule is prioritized:
         state = jnp.int32(SETUP.iterations - 1)
     choice = chosen(rule(SETUP), s, state)
-    weight = choice.weight / np.sum(choice.probability * choice.weight)
     np.testing.assert_allclose(np.sum(choice.probability), 1.0, rtol=1e-5)
-    mean = np.sum(choice.probability * weight * term)
+    mean = np.sum(choice.probability * choice.weight * term)
     np.testing.assert_allclose(mean, term[on].mean(), rtol=1e-4)
     unweighted = np.sum(choice.probability * term)
     assert abs(unweighted - term[on].mean()) > 0.01
     if rule is gradient_norm:
-        np.testing.assert_allclose(np.sum(choice.probability * choice.weight), 1.0, rtol=1e-5)
         value = np.sum(choice.value_probability * choice.value_weight * term)
         np.testing.assert_allclose(value, term[on].mean(), rtol=1e-4)
 
@@ -327,7 +437,15 @@ def test_counts_round_up_and_not_for_a_last_bit() -> None:
         (kondo, {"share": float("nan")}, "share must be a number"),
         (pods, {"length": 0}, "length must be a number at least 1"),
         (pods, {"length": 1.5}, "length must be a whole number"),
-        (vex_oracle, {"keep": "top"}, "keep must be one of high, low, both, not 'top'"),
+        (
+            vex_oracle,
+            {"keep": "top"},
+            "keep must be one of informative, high, low, both, not 'top'",
+        ),
+        (vex_oracle, {"keep": "informative", "share": 0.5}, "share is read with keep high, low or"),
+        (vex_oracle, {"keep": "low", "threshold": 0.5}, "threshold is read with keep informative"),
+        (vex_oracle, {"threshold": -1}, "threshold must be a number at least 0"),
+        (kondo, {"on": "std"}, "on must be one of mean, all, not 'std'"),
     ],
 )
 def test_numbers_that_make_no_rule_are_refused(rule, numbers, text) -> None:

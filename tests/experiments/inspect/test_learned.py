@@ -121,8 +121,9 @@ def mask_of(sampler: str, made: Asked, rollout: Rollout) -> np.ndarray:
         score = oracle.segment_scores(a.reshape(STEPS, -1), 4)
         return oracle.segments_to_rows(oracle.pods_keep(score), STEPS, 4).ravel()
     if sampler == "vex-oracle":
-        error = returns - np.asarray(rollout.value).ravel()
-        return oracle.vex_keep(oracle.vex_share(error, returns), 0.5, "high")
+        columns = [np.asarray(x).reshape(STEPS, -1).T for x in (a, returns)]
+        share = np.stack([oracle.vex_share(*column) for column in zip(*columns, strict=True)], 1)
+        return oracle.informative_keep(np.maximum(share, -5.0)).ravel()
     entropy = heads(made, rollout)[1]
     old = np.asarray(rollout.log_prob).ravel()
     return oracle.kondo_keep(oracle.standardise(a), old, 0.3, entropy)

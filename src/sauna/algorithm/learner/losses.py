@@ -24,6 +24,7 @@ class Minibatch(NamedTuple):
     policy_scale: Any  # [B] multiplies the policy term; None: 1
     value_mask: Array  # [B] 1 for a row whose value and Vex terms count
     value_scale: Any  # [B] multiplies them; None: 1
+    mean_scale: Any = None  # [B] multiplies the gradient of a Gaussian's mean alone; None: 1
 
 
 class Losses(NamedTuple):
@@ -95,27 +96,39 @@ def weigh_policy(
       log_ratio: `[B]` what the objective is a function of; for A2C the log-probability.
 
     Returns:
-      `log_ratio`, with the gradient of the mean scaled if the rule weighs that alone; the mask and
+      `log_ratio`, with the gradient of the mean scaled if a rule weighs that alone; the mask and
       the scale (None: 1) of the terms `[B]`; the effective size of the weights, if there are any.
     """
-    if rules.loss_weight is None:
-        return log_ratio, minibatch.policy_mask, minibatch.policy_scale, None
-    rows = minibatch.rows
-    terms = loss_terms(
-        rows, minibatch.advantage, minibatch.policy_mask, log_prob, entropy, distribution
-    )
-    scale: Any
-    mask, scale = rules.loss_weight.weight(terms)
-    effective = effective_size(mask * scale)
-    if rules.loss_weight.on_mean and distribution.has_log_std:
+    rows, effective = minibatch.rows, None
+    mask, scale, mean_scale = minibatch.policy_mask, minibatch.policy_scale, minibatch.mean_scale
+    if rules.loss_weight is not None:
+        terms = loss_terms(rows, minibatch.advantage, mask, log_prob, entropy, distribution)
+        mask, own = rules.loss_weight.weight(terms)
+        effective = effective_size(mask * times(own, mean_scale))
+        if rules.loss_weight.on_mean and distribution.has_log_std:
+            mean_scale = times(own, mean_scale)
+        else:
+            scale = times(own, scale)
+    if mean_scale is not None:
         mean, log_std = jnp.split(output.policy, 2, -1)
-        parameters = jnp.concatenate([scale_gradient(mean, scale[:, None]), log_std], -1)
+        parameters = jnp.concatenate([scale_gradient(mean, mean_scale[:, None]), log_std], -1)
         change = distribution.log_prob(parameters, rows.action) - jax.lax.stop_gradient(log_prob)
         log_ratio = jnp.where(rows.weight > 0, jax.lax.stop_gradient(log_ratio) + change, 0.0)
-        scale = None
-    if minibatch.policy_scale is not None:
-        scale = minibatch.policy_scale if scale is None else scale * minibatch.policy_scale
     return log_ratio, mask, scale, effective
+
+
+def times(scale: Array, other: Any) -> Array:
+    """Multiplies scales `[B]`, of which the second may be None: 1."""
+    return scale if other is None else scale * other
+
+
+def scale_of_kept(kept: Array, weight: Array) -> Array:
+    """Scales rows `[B]` so that their mean over all rows is the mean over the kept ones.
+
+    Args:
+      kept: the weights of the rows that are kept, 0 for the others; weight: of all rows.
+    """
+    return kept * (jnp.maximum(jnp.sum(weight), 1.0) / jnp.maximum(jnp.sum(kept), 1.0))
 
 
 def loss_terms(

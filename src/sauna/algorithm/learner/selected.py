@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.losses import Losses, Minibatch, standardize
+from sauna.algorithm.learner.losses import Losses, Minibatch, scale_of_kept, standardize, times
 from sauna.algorithm.learner.replay import pool_rows
 from sauna.algorithm.learner.samples import recomputed
 from sauna.algorithm.learner.sequence_choice import (
@@ -25,6 +25,7 @@ from sauna.algorithm.learner.sequence_choice import (
 from sauna.algorithm.learner.sequences import rollout_outputs, row_outputs, units
 from sauna.algorithm.learner.update import (
     Parts,
+    acts_on_mean,
     gradient_step,
     loss_advantage,
     minibatch_advantage,
@@ -296,9 +297,13 @@ def minibatch(
         choice.probability is not None and not for_all
     )
     value_rows = _rows(batch, value_index, counts) if separate else rows
-    mask = rows.weight
+    mask, mean_scale = rows.weight, None
     if choice.keep is not None and not for_all:
-        mask = mask * choice.keep[index]
+        kept = mask * choice.keep[index]
+        if acts_on_mean(parts):
+            mean_scale = scale_of_kept(kept, mask)
+        else:
+            mask = kept
     advantage = minibatch_advantage(rows._replace(weight=mask), parts.config)
     value_weight = choice.value_weight if for_all else None
     scale = None if choice.weight is None else choice.weight[index]
@@ -313,6 +318,7 @@ def minibatch(
         policy_scale=scale,
         value_mask=value_rows.weight,
         value_scale=None if value_weight is None else value_weight[value_index],
+        mean_scale=mean_scale,
     )
 
 
@@ -336,8 +342,8 @@ def _counted(
     stop = jnp.bool_(False) if losses.stop is None else losses.stop
     effective = losses.effective_size
     if effective is None:
-        scale = 1.0 if part.policy_scale is None else part.policy_scale
-        effective = effective_size(part.policy_mask * scale)
+        weight = times(times(part.policy_mask, part.policy_scale), part.mean_scale)
+        effective = effective_size(weight)
     more = Totals(
         jax.tree.map(jnp.add, totals.losses, losses._replace(stop=None, effective_size=None)),
         totals.gradient_norm + norm,

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sauna.algorithm.learner.losses import Minibatch
+from sauna.algorithm.learner.losses import Minibatch, scale_of_kept
 from sauna.algorithm.learner.sequences import as_rows, flat, in_sequences, joined, to_sequences
-from sauna.algorithm.learner.update import Parts, minibatch_advantage, vex_targets
+from sauna.algorithm.learner.update import Parts, acts_on_mean, minibatch_advantage, vex_targets
 from sauna.algorithm.types import Array, Batch, Choice, Draw, Rollout
 
 
@@ -83,7 +83,9 @@ def minibatches_of_sequences(
         value_rows = rows
         if value_weight is not None:
             value_rows = rows_of(value_index, value_weight[value_index] * there)
-        mask = flat(counted[index] * there)
+        mask, mean_scale = flat(counted[index] * there), None
+        if choice.keep is not None and acts_on_mean(parts):
+            mask, mean_scale = rows.weight, scale_of_kept(mask, rows.weight)
         return Minibatch(
             rows=rows,
             value_rows=value_rows,
@@ -93,6 +95,7 @@ def minibatches_of_sequences(
             policy_scale=None if scale is None else flat(scale[index]),
             value_mask=value_rows.weight,
             value_scale=None if value_scale is None else flat(value_scale[value_index]),
+            mean_scale=mean_scale,
         )
 
     return make

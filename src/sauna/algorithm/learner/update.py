@@ -57,6 +57,13 @@ def plain_minibatch(rows: Batch, parts: Parts) -> Minibatch:
     return Minibatch(rows, rows, advantage, target, rows.weight, None, rows.weight, None)
 
 
+def acts_on_mean(parts: Parts) -> bool:
+    """Whether a sampler's mask chooses rows for the gradient of a Gaussian's mean alone."""
+    sampler = parts.rules.sampler
+    on_policy = parts.config.selection_losses == "policy" and parts.policy.distribution.has_log_std
+    return on_policy and sampler is not None and sampler.on_mean
+
+
 def minibatch_advantage(rows: Batch, config: Config) -> Array:
     """The advantages `[B]` as the loss uses them, unless a larger set has made them so before."""
     if config.normalize_over == "minibatch":

@@ -11,7 +11,7 @@ from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 
 
 def gradient_norm(setup: SamplerSetup, uniform: float = 0.1, share: float = 1.0) -> Sampler:
-    """Draws by the norm of the surrogate's gradient at the policy head, without bias.
+    """Draws by the norm of the surrogate's gradient at the policy head; its mean stays.
 
     `p = (1 - uniform) g / sum g + uniform / M`, the policy term weighted by exactly `1 / (M p)`.
     With `z = (a - mu) / sigma` and h the last hidden layer:
@@ -22,7 +22,8 @@ def gradient_norm(setup: SamplerSetup, uniform: float = 0.1, share: float = 1.0)
 
     the first also under a tanh, whose slope no parameter moves, the last summed over the components
     c of a factored action. The value loss draws rows of its own, by
-    `|R - V|`. After Katharopoulos & Fleuret 2018.
+    `|R - V|`. The entropy bonus alone is biased: it is a mean over the rows drawn by p, unweighted.
+    After Katharopoulos & Fleuret 2018.
     """
 
     check_range("uniform", uniform, 0.0, 1.0)

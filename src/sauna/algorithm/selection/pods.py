@@ -11,17 +11,17 @@ from sauna.algorithm.types import Array, Choice, Sampler, SamplerSetup, Samples
 def pods(setup: SamplerSetup, length: int = 64, share: float = 0.5) -> Sampler:
     """Keeps the segments that give their scores the largest variance.
 
-    A segment is `length` steps of one env, its score the sum of A. The j highest and `m - j`
-    lowest scores are kept, with the best j, which is the best subset of m (the smallest j where
-    several are as good). Source: Xu et al. 2025, arXiv 2504.13818, there on whole answers of a
-    language model.
+    A segment is `length` steps of one env, or its whole rollout if that is shorter. Its score is
+    the sum of A. The j highest and `m - j` lowest scores are kept, with the best j, which is the
+    best subset of m (the smallest j where several are as good).
+    Source: Xu et al. 2025, arXiv 2504.13818, there on whole answers of a language model.
     """
     check_share(share)
     check_range("length", length, 1)
     if length != int(length):
         raise ValueError(f"length must be a whole number of steps, not {length}")
-    length = int(length)
     steps, envs = setup.rollout_steps, setup.envs
+    length = min(int(length), steps)
     pieces = -(-steps // length)
     count = count_of(share, pieces * envs)
 

@@ -15,10 +15,15 @@ def prioritized(
 ) -> Sampler:
     """Draws by `p = (|A| + 1e-6)^power / sum`, with replacement.
 
-    The policy term of a row is multiplied by `(M p)^-b / max`, the maximum over all rows; value
-    and entropy are not weighted. `b` rises from `correction` to 1 over the budget. Source:
-    PufferLib 3, after Schaul et al. 2016; there it works on segments of 64 steps, without
-    replacement, and `b` never reaches 1.
+    The policy term of a row is multiplied by `w = (M p)^-b`, divided by `sum(p w)`: the mean weight
+    of a draw is 1, so that the policy loss keeps its size beside the value loss and the entropy
+    bonus. These two are not weighted, and are means over rows drawn by p. `b` rises from
+    `correction` to 1 over the budget. At b = 1 the policy term has the mean of all rows, and
+    `sum(p w)` is 1 by itself.
+    Source: PufferLib 3, after Schaul et al. 2016. PufferLib does not divide, works on segments of
+    64 steps, draws without replacement, and its `b` never reaches 1. Schaul et al. divide by the
+    largest weight, which is that of the row of |A| nearest 0: the policy loss is then as good as
+    gone beside the others.
     """
 
     check_range("power", power, 0.0)
@@ -32,7 +37,6 @@ def prioritized(
         b = correction + (1.0 - correction) * progress
         number = jnp.sum(samples.present)
         weight = jnp.where(samples.present, (number * jnp.where(p > 0, p, 1.0)) ** -b, 0.0)
-        choice = Choice(probability=p, weight=weight / jnp.max(weight), score=size)
-        return count + 1, choice
+        return count + 1, Choice(probability=p, weight=weight / jnp.sum(p * weight), score=size)
 
     return Sampler(lambda: jnp.int32(0), choose, share=share)

@@ -24,8 +24,12 @@ def informative(vex: Array, history: History, threshold: Array) -> Array:
     Written as a negation so that a NaN prediction is kept, where the finite checks see it, and
     threshold 0 keeps everything.
     """
-    ratio = jnp.abs(vex) / (jnp.abs(median(history)) + EPSILON)
-    return (history.number == 0) | ~(ratio < threshold)
+    return (history.number == 0) | ~(ratio_to_median(vex, history) < threshold)
+
+
+def ratio_to_median(vex: Array, history: History) -> Array:
+    """The left side of eq. 7: `|x| / (|median| + eps)`."""
+    return jnp.abs(vex) / (jnp.abs(median(history)) + EPSILON)
 
 
 def sauna_per_env(history: str, quota: int) -> StepFilter:

@@ -22,6 +22,8 @@ from sauna.system.safe_write import own_folder
 
 SEEDS = 3  # per unit: members of one process share the cost of each vector step
 RULES = 1  # to be raised when a default changes, so that runs of before are not taken for new ones
+# How often the numbers of a rule have changed since units got their names; see `revision`.
+REVISIONS = {"kondo": 1, "prioritized": 1, "vex-oracle": 1, "pods": 1}
 
 
 class Unit(NamedTuple):
@@ -97,11 +99,28 @@ def _unit(arm: Arm, task: str, seeds: tuple[int, ...]) -> Unit:
 def identity(arm: Arm, task: str, seeds: tuple[int, ...]) -> dict[str, Any]:
     """What of a run's config differs from the defaults: the same for the same training.
 
-    The defaults are those of when units got their names.
+    The defaults are those of when units got their names. A rule whose numbers have changed since
+    then adds its revision, so that its runs of before are not taken for new ones.
     """
-    config = to_json(check(arm._replace(seeds=seeds), task))
+    config = check(arm._replace(seeds=seeds), task)
     usual = {**to_json(Config()), **BEFORE, "arm": ["sauna"]}
-    return {name: value for name, value in config.items() if value != usual[name]}
+    found = {name: value for name, value in to_json(config).items() if value != usual[name]}
+    number = revision(config)
+    return {**found, "rule_revision": number} if number else found
+
+
+def revision(config: Config) -> int:
+    """Returns how often the numbers of a run's sampler have changed; 0 where none has moved.
+
+    Runs of before stay valid where a change moved nothing: of `pods` whose segments fit into a
+    rollout, of controls of `prioritized` that are not weighted, of `kondo` for all losses.
+    """
+    unmoved = {
+        "pods": config.rollout_steps >= json.loads(config.sampler_kwargs).get("length", 64),
+        "prioritized": config.control not in ("none", "reversed"),
+        "kondo": config.selection_losses == "all",
+    }
+    return 0 if unmoved.get(config.sampler) else REVISIONS.get(config.sampler, 0)
 
 
 def study_identity(spec: Spec) -> list[Any]:
