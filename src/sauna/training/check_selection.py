@@ -20,7 +20,7 @@ from sauna.system.errors import BadInput
 # Arguments that are read with continuous actions alone: by field, by rule.
 CONTINUOUS_ALONE: dict[str, dict[str, tuple[str, ...]]] = {
     "loss_weight": {"delight": ("centred", "on")},
-    "sampler": {"kondo": ("centred",)},
+    "sampler": {"kondo": ("centred", "on")},
 }
 
 
