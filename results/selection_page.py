@@ -86,9 +86,18 @@ def screen_answer() -> str | None:
                 cells.setdefault(label, {})[task] = cell
     if not cells:
         return None
-    planned = [task for name in SCREENS for task in load_spec(name).tasks]
+    specs = [load_spec(name) for name in SCREENS]
+    planned = [task for spec in specs for task in spec.tasks]
     tasks = [task for task in planned if any(task in found for found in cells.values())]
-    whole = [task for task in tasks if all(task in found for found in cells.values())]
+    whole = [
+        task
+        for task in tasks
+        if all(
+            task in cells.get(label, {})
+            for label, of_task in planned_of(specs)
+            if of_task == task and label != "ppo" and not is_control(label)
+        )
+    ]
     better = [f"`{label}`" for label, found in cells.items() if _is_better(found.values())]
     worse = [x for x, found in cells.items() if any(c.word == "worse" for c in found.values())]
     part = f" and a part of {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""

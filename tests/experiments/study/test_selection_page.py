@@ -86,11 +86,16 @@ def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> N
         "selection-screen-mujoco": on("Hopper-v5", ppo, high),
     }
     monkeypatch.setattr(selection_page, "load", found.get)
+    labels, tasks = ["ppo", "high", "low", "low+random"], ["CartPole-v1", "Hopper-v5"]
+    planned = {(label, task): 5 for label in labels for task in tasks}
+    monkeypatch.setattr(selection_page, "planned_of", lambda specs: planned)
     answer = selection_page.screen_answer()
     assert answer is not None
     assert answer.startswith("**not decided** after 5 seeds on 1 of 8 tasks and")
     assert "on 1 of 8 tasks and a part of 1 more. By the intervals" in answer
     assert "better on a task: `high`, and 1 of 2 scored worse on a task" in answer
+    planned["untrained", "CartPole-v1"] = 5  # a rule that no task has yet counts, too
+    assert "on 0 of 8 tasks and a part of 2 more" in (selection_page.screen_answer() or "")
 
 
 def shown(*cells: dict[str, Any]) -> dict[str, str]:
