@@ -27,8 +27,8 @@ WORDS = {
     "the goal in 2 of its 20 episodes.",
     "MiniGrid-KeyCorridorS3R1-v0": f"{SAMPLED} With the most likely actions, one seed does not "
     "reach the goal in 1 of its 20 episodes.",
-    "MiniGrid-RedBlueDoors-6x6-v0": f"{SAMPLED} With the most likely actions, many episodes open the "
-    "wrong door first or never end.",
+    "MiniGrid-RedBlueDoors-6x6-v0": f"{SAMPLED} With the most likely actions, many episodes "
+    "open the wrong door first or never end.",
     "MiniGrid-Unlock-v0": f"{SAMPLED} With the most likely actions, one seed does not reach the "
     "goal in 4 of its 20 episodes.",
     "gymnax/Breakout-MinAtar": "each seed settles in the first half of the training, at its own "
