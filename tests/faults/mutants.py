@@ -126,7 +126,11 @@ MUTANTS = [
     *_of(
         "algorithm/learner/losses.py",
         "ppo samples",
-        ("mean over empty slots, too", "jnp.maximum(jnp.sum(weight), 1.0)", "weight.shape[0]"),
+        (
+            "mean over empty slots, too",
+            "jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)",
+            "jnp.sum(x * weight) / weight.shape[0]",
+        ),
         (
             "advantages not centred",
             "centred = advantage - weighted_mean(advantage, weight)",
