@@ -493,8 +493,16 @@ MUTANTS = [
     *_of(
         "algorithm/selection/vex_filter.py",
         "vex_filter samples reference",
-        ("filter inverted", "~(ratio < threshold)", "~(ratio > threshold)"),
-        ("strict threshold", "~(ratio < threshold)", "~(ratio <= threshold)"),
+        (
+            "filter inverted",
+            "~(ratio_to_median(vex, history) <",
+            "~(ratio_to_median(vex, history) >",
+        ),
+        (
+            "strict threshold",
+            "~(ratio_to_median(vex, history) <",
+            "~(ratio_to_median(vex, history) <=",
+        ),
         ("first step compared with nothing", "(history.number == 0) | ", ""),
         ("sign of Vex counts", "jnp.abs(vex) /", "vex /"),
         (
