@@ -182,10 +182,10 @@ def _ended(
     }
 
 
-def _sum(numbers: Iterable[int]) -> int | None:
-    """Returns the sum; None of nothing."""
+def _sum(numbers: Iterable[float]) -> int | None:
+    """Returns the sum of whole numbers; None of nothing."""
     known = list(numbers)
-    return sum(known) if known else None
+    return int(sum(known)) if known else None
 
 
 def _compute(
