@@ -28,19 +28,19 @@ def collapse_text(results: Mapping[str, Any]) -> str:
         for cell in results["cells"]
     }
     base = found.pop(results["baseline"])
-    raw = [_p_value(seeds, base) for seeds in found.values()]
+    p_values = holm([_p_value(seeds, base) for seeds in found.values()])
     rows = [
         ["Arm", "Seeds that collapsed", "Exact p against the baseline, after Holm"],
         [f"`{results['baseline']}`", _count(base), "-"],
     ]
-    for (label, seeds), p in zip(found.items(), holm(raw), strict=True):
+    for (label, seeds), p in zip(found.items(), p_values, strict=True):
         rows.append([f"`{label}`", _count(seeds), f"{p:.3f}"])
     return "\n\n".join(
         (
             "A seed has collapsed if its final return is below half of its best return, or if it "
             "failed.",
             markdown(rows),
-            listed([_answer(base, found, holm(raw))]),
+            listed([_answer(base, found, p_values)]),
         )
     )
 

@@ -215,8 +215,7 @@ def compare(
     """
     from sauna.experiments.study.command import chosen_arms, compare_command, comparison, study
 
-    given = {n: v for n, v in settings.items() if v is not None}  # as in `train`
-    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in given.items()}}
+    overrides = {"env": _env_name(env), **{n: _named(n, v) for n, v in _given(settings).items()}}
     for name in PARTS:
         if is_local(str(overrides.get(name))):
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
@@ -258,8 +257,7 @@ def resume(
         (`env`, `network`, `filter`, `vex_target`) that were passed by value when the run started.
     """
     display: Display = _Silent() if quiet else make_display()
-    given = {n: v for n, v in changes.items() if v is not None}  # as in `train`
-    named = {n: _named(n, v) if n == "track" else v for n, v in given.items()}
+    named = {n: _named(n, v) if n == "track" else v for n, v in _given(changes).items()}
     rest = provide(Path(path), named, PARTS)
     how = trust, accept_changed_code, restart_schedule, inexact, callback
     run = runs.reopen(Path(path), rest, display, *how)
@@ -297,6 +295,11 @@ def load(
     artifact = load_artifact(folder, iteration=checkpoint, trust=trust)
     provide(folder, parts, PARTS)
     return TrainedPolicy(artifact, member, best=best)
+
+
+def _given(settings: dict[str, Any]) -> dict[str, Any]:
+    """Leaves out what is None, which means not given, as in `train`."""
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _named(name: str, value: Any) -> Any:

@@ -302,10 +302,10 @@ def _resume(values: dict[str, Any]) -> None:
 
     path = Path(values.pop("run"))
     names = ("trust", "accept_changed_code", "restart_schedule", "inexact")
-    how = [values.pop(name) for name in names]
+    how = {name: values.pop(name) for name in names}
     display = make_display()
-    run = runs.reopen(path, values, display, *how)
-    train_and_draw(run, display, resume=True, inexact=how[-1])
+    run = runs.reopen(path, values, display, **how)
+    train_and_draw(run, display, resume=True, inexact=how["inexact"])
     _print_curve(path)
 
 

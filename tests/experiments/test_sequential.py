@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sauna.experiments.sequential import DESIGN, LEVEL, Look, look_at, tournament
+from sauna.experiments.sequential import DESIGN, Look, look_at, tournament
+
+LEVEL = sum(look.level for look in DESIGN)
 
 
 def test_the_looks_share_one_level() -> None:

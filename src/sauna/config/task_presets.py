@@ -142,8 +142,8 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
         "trunk": "shared",
     },
     "minigrid": _MINIGRID,
-    # The tasks of which RL Zoo's rollouts are longer. The entropy bonus is our own: without it one
-    # seed of three never found RedBlueDoors' reward.
+    # The tasks of which RL Zoo's rollouts are longer. The entropy bonus is our own: without it a
+    # seed may never find RedBlueDoors' reward.
     "minigrid-long": {
         **_MINIGRID,
         "rollout_steps": 512,

@@ -41,7 +41,6 @@ DESIGN = (
     Look(10, 0.015, 0.55),
     Look(16, 0.03, 0.0),
 )
-LEVEL = sum(look.level for look in DESIGN)
 
 
 class Standing(NamedTuple):

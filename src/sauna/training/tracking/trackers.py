@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,7 @@ class Trackers:
                 urls = _urls(found)
                 self._kept[name] = found
                 for row in earlier:
-                    self._give(name, row, row)
+                    self._give(name, row, tracker)
                 self._ended.pop(name, None)
             except _FAILURES as error:
                 self._end(name, error)
@@ -148,11 +149,11 @@ class Trackers:
         ended = {ENDED: self._ended} if self._ended else {}
         run_directory.write_json(self._path / FILE, self._kept | ended)
 
-    def _give(self, name: str, row: Mapping[str, Any], whole: Mapping[str, Any]) -> None:
+    def _give(self, name: str, row: Mapping[str, Any], tracker: Tracker) -> None:
         """Gives a tracker a row, unless it has it."""
         done, member, steps = self._done[name], row["member"], row["env_steps"]
         if steps > done.get(member, -1):
-            self._open[name].row(whole)
+            tracker.row(row)
             done[member] = steps
 
     def rows(self, rows: Sequence[Mapping[str, Any]], timing: Mapping[str, float]) -> None:
@@ -160,10 +161,7 @@ class Trackers:
         for row in rows:
             whole = {**row, **timing}
             for name in list(self._open):
-                try:
-                    self._give(name, row, whole)
-                except _FAILURES as error:
-                    self._end(name, error)
+                self._call(name, partial(self._give, name, whole))
 
     def summary(self, members: Mapping[str, Mapping[str, Any]], complete: bool) -> None:
         """Takes the final numbers of each member."""
