@@ -84,7 +84,11 @@ BY_SPACES = {  # environments that the zoo does not know, for the presets that i
 }
 EVERY = (*ENVS, *BY_SPACES)
 # Env steps, if those of `sauna train` take long.
-SHORTER = {"CarRacing-v3": 80_000, "MiniGrid-RedBlueDoors-6x6-v0": 400_000}
+SHORTER = {
+    "BipedalWalkerHardcore-v3": 5_000_000,
+    "MiniGrid-RedBlueDoors-6x6-v0": 400_000,
+    "playground/CartpoleBalance": 10_000_000,
+}
 # Why an environment is not among them, by a pattern of its whole name. `--only` trains it, too.
 LEFT_OUT = {
     r"ALE/.+|BipedalWalkerHardcore-v3|sauna/HumanoidFlagrunHarder-v0": "days on two cores",

@@ -20,13 +20,12 @@ from typing import Any
 
 from sauna.config.plugins import is_local
 from sauna.config.settings import fields_with
-from sauna.config.task_presets import TASK_PRESETS
 from sauna.system.errors import BadInput, SaunaError
 from sauna.system.safe_read import read_file
 from sauna.system.safe_write import open_new, sync_folder
 
 FIELDS = (*fields_with("plugin"), "tasks", "measure", "track", "wrap")  # that may name code
-OWN_WRAPPERS = {path for preset in TASK_PRESETS.values() for path in preset.get("wrap", ())}
+OWN_WRAPPERS = ("sauna.envs.small_grey:SmallGrey", "sauna.envs.car_racing:EveryEighth")
 # Ids of Gymnasium whose arguments name an environment of another library.
 WRAPPERS = ("GymV21Environment", "GymV26Environment")
 KEY_BYTES = 32

@@ -11,7 +11,6 @@ import gymnasium
 import numpy as np
 
 SIDE = 64  # pixels
-TIMES = 2  # that an action is taken
 BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue (ITU-R BT.601)
 
 
@@ -35,6 +34,8 @@ class SmallGrey(gymnasium.Wrapper[Any, Any, Any, Any]):
       ValueError: the environment shows something else.
     """
 
+    times = 2  # that an action is taken
+
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
         space: Any = env.observation_space
@@ -50,12 +51,16 @@ class SmallGrey(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         total = 0.0
-        for _ in range(TIMES):
-            picture, reward, terminated, truncated, info = self.env.step(action)
+        for left in reversed(range(self.times)):
+            picture, reward, terminated, truncated, info = self._step(action, last=left == 0)
             total += float(reward)
             if terminated or truncated:
                 break
         return self._seen(picture), total, terminated, truncated, info
+
+    def _step(self, action: Any, last: bool) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment; only the picture of the last time, or of an end, is seen."""
+        return self.env.step(action)
 
     def _seen(self, picture: np.ndarray) -> np.ndarray:
         grey = self._rows @ (picture @ BRIGHTNESS) @ self._columns
