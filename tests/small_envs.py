@@ -596,3 +596,19 @@ def make_vector(number: int = 2) -> Any:
 
 
 INSTANCE = Scripted()
+
+
+class Colours(SmallEnv):
+    """Pictures `[96, 128, 3]`, red above and blue below, whose brightness is the step."""
+
+    observation_space = spaces.Box(0, 255, (96, 128, 3), np.uint8)
+    action_space = spaces.Discrete(2)
+    length = 5
+
+    def observe(self) -> np.ndarray:
+        picture = np.zeros((96, 128, 3), np.uint8)
+        picture[:48, :, 0] = picture[48:, :, 2] = 10 * self.t
+        return picture
+
+    def reward(self, action: int) -> float:
+        return float(self.t)

@@ -4,33 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gymnasium import spaces
 
-from sauna.config.presets import AUTO, resolve
 from sauna.config.trust import named_code
 from sauna.envs.make import make_env
 from sauna.envs.small_grey import SIDE, SmallGrey, shares
-from sauna.envs.wrapping import Wrapping, wrapped, wrapping_of
+from sauna.envs.wrapping import Wrapping, wrapped
 from sauna.system.errors import BadInput
-from small_envs import SmallEnv
+from small_envs import Colours
 
 PATH = "sauna.envs.small_grey:SmallGrey"
-
-
-class Colours(SmallEnv):
-    """Pictures `[96, 128, 3]`, red above and blue below, whose brightness is the step."""
-
-    observation_space = spaces.Box(0, 255, (96, 128, 3), np.uint8)
-    action_space = spaces.Discrete(2)
-    length = 5
-
-    def observe(self) -> np.ndarray:
-        picture = np.zeros((96, 128, 3), np.uint8)
-        picture[:48, :, 0] = picture[48:, :, 2] = 10 * self.t
-        return picture
-
-    def reward(self, action: int) -> float:
-        return float(self.t)
 
 
 def test_a_pixel_is_the_mean_of_what_it_covers() -> None:
@@ -70,9 +52,7 @@ def test_other_observations_are_refused_in_a_line() -> None:
     assert "\n" not in str(error.value)
 
 
-def test_car_racing_is_seen_so_and_nobody_has_to_trust_it() -> None:
-    config = resolve({"env": "CarRacing-v3", "preset": AUTO})
-    assert wrapping_of(config) == Wrapping((PATH,), 2)
+def test_nobody_has_to_trust_it_and_pictures_can_be_stacked() -> None:
     assert named_code({"config": {"wrap": [PATH], "env": PATH}}) == [["env", PATH]]
-    env = wrapped(Colours(), wrapping_of(config))
+    env = wrapped(Colours(), Wrapping((PATH,), 2))
     assert env.reset(seed=0)[0].shape == (SIDE, SIDE, 2)

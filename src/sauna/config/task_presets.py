@@ -126,8 +126,8 @@ TASK_PRESETS: dict[str, dict[str, Any]] = {
         "clip_range_schedule": "linear",
         "entropy_coef": 0.001,
     },
-    # Own numbers. With RL Zoo's and gSDE an hour of one core ends below 0. An action that is held
-    # for eight frames moves the car at once, and one of a Beta distribution does not reverse it.
+    # Own numbers. RL Zoo's need gSDE and 4,000,000 env steps of two frames. An action that is held
+    # for eight frames shows sooner what it does, and an episode has 125 env steps.
     "car-racing": {
         **_SB3,
         "wrap": ("sauna.envs.car_racing:EveryEighth",),
@@ -196,7 +196,7 @@ TASK_PRESET_HELP = {
     "lunar-lander": "LunarLander, both forms, with RL Zoo's numbers",
     "bipedal-walker": "BipedalWalker with RL Zoo's numbers",
     "bipedal-walker-hardcore": "BipedalWalkerHardcore with RL Zoo's numbers",
-    "car-racing": "CarRacing with RL Zoo's numbers: pairs of small grey pictures",
+    "car-racing": "CarRacing: every eighth picture, small and grey; actions from a Beta",
     "minigrid": "MiniGrid with RL Zoo's numbers",
     "minigrid-long": "the same with rollouts of 512 steps and a bonus (FourRooms, RedBlueDoors)",
     "playground": "MuJoCo Playground's control tasks: 2048 environments on an accelerator",
