@@ -48,6 +48,36 @@ def advance(task: Task, at: Robot, action=IDLE, draws=NO_DRAWS) -> rules.Outcome
     return rules.advance(np, task, at, action, draws)
 
 
+def test_many_robots_are_judged_as_each_alone() -> None:
+    """To the bit: near the flag, upside down, at a throw, and with a state that is not finite."""
+    random, many = np.random.default_rng(0), 60
+    quaternion = random.normal(size=(many, 4))
+    quaternion[:5] = np.array([1.0, 0.0, 1.0, 0.0])  # pitched by a right angle
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    parts = [random.normal(size=(many, n)) for n in (3, 3, 17, 17)]
+    parts[0][:, 2] = random.uniform(0.2, 1.4, many)
+    robots = Robot(parts[0], quaternion, parts[1], parts[2], parts[3], np.ones((many, 2)))
+    robots.velocity[7] = np.nan
+    tasks, seen = rules.begin(np, robots, random.normal(size=(many, 2)))
+    frames = np.where(np.arange(many) % 2, 120, 121).astype(np.int32)
+    tasks = tasks._replace(frame=frames, flag_age=random.integers(140, 150, many))
+    action, draws = random.uniform(-1, 1, (many, 17)), random.random((many, rules.STEP_DRAWS))
+    outcome = rules.advance(np, tasks, robots, action, draws)
+    alone = lambda whole, k: type(whole)(*(part[k] for part in whole))  # noqa: E731
+    for k in range(many):
+        one, task = alone(robots, k), alone(tasks, k)
+        np.testing.assert_array_equal(rules.begin(np, one, task.flag)[1], seen[k])
+        its = rules.advance(np, task, one, action[k], draws[k])
+        for single, row in zip(flat(its), flat(outcome), strict=True):
+            assert np.asarray(single).tobytes() == np.ascontiguousarray(row[k]).tobytes()
+    assert outcome.throw.now.sum() > 5 and outcome.terminated.tolist().index(True) == 7
+
+
+def flat(outcome: rules.Outcome) -> list[np.ndarray]:
+    parts = [part if isinstance(part, tuple) else (part,) for part in outcome]
+    return [array for part in parts for array in part]
+
+
 def test_the_model_has_roboschools_motors_and_cube() -> None:
     model = load_model()
     assert model.nu == rules.JOINTS == 17

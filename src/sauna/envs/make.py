@@ -276,7 +276,7 @@ def in_process_envs(
         from sauna.envs.host.atari_envs import AtariEnvs
 
         return AtariEnvs(make, seeds)
-    if backend == "auto" and is_mujoco(env):
+    if backend == "auto" and steps_mujoco(env):
         from sauna.envs.host.mujoco_envs import MujocoEnvs, time_limit
 
         first = make()
@@ -290,10 +290,19 @@ def in_process_envs(
 
 def is_mujoco(env: str) -> bool:
     """Whether a registered environment's class is one of Gymnasium's MuJoCo tasks."""
+    return _is_of(env, "gymnasium.envs.mujoco")
+
+
+def steps_mujoco(env: str) -> bool:
+    """Whether a registered environment `is_mujoco`, or HumanoidFlagrunHarder."""
+    return is_mujoco(env) or _is_of(env, "sauna.envs.flagrun")
+
+
+def _is_of(env: str, module: str) -> bool:
     import gymnasium
 
     spec = gymnasium.registry.get(env)
-    return spec is not None and str(spec.entry_point).startswith("gymnasium.envs.mujoco")
+    return spec is not None and str(spec.entry_point).startswith(module)
 
 
 def is_native(env: str, env_kwargs: dict[str, Any]) -> bool:

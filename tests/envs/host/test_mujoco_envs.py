@@ -8,12 +8,16 @@ import gymnasium
 import numpy as np
 import pytest
 
+from sauna.envs.flagrun import host, rows
+from sauna.envs.flagrun import task as rules
+from sauna.envs.flagrun.physics import after_throw
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.host.mujoco_envs import MujocoEnvs
 from sauna.envs.host.mujoco_tasks import TASKS, Runner, Task, make_task
 from sauna.envs.make import in_process_envs
 
+FLAGRUN = "sauna/HumanoidFlagrunHarder-v0"
 SEEDS = [(3, 0), (3, 1), (7, 0)]
 NAMES = sorted(
     name
@@ -76,15 +80,28 @@ def test_equals_gymnasium(name: str, kwargs: dict) -> None:
     assert assert_equals_gymnasium(name, {**limit, **kwargs}, steps=190) >= 3
 
 
+def test_the_flag_run_equals_its_own_environment(monkeypatch) -> None:
+    """Through falls and time limits; flags move and cubes fly sooner than they do."""
+    sooner = {"TIME_LIMIT": 60, "GROUND_STEPS": 40, "FLAG_STEPS": 7}
+    for name, value in {**sooner, "THROW_EVERY": 3, "THROW_AFTER": 0}.items():
+        monkeypatch.setattr(rules, name, value)
+    thrown = []
+    throw = lambda *arguments: thrown.append(1) or after_throw(*arguments)  # noqa: E731
+    for module in (host, rows):
+        monkeypatch.setattr(module, "after_throw", throw)
+    assert assert_equals_gymnasium(FLAGRUN, {}, steps=190) >= 9
+    assert len(thrown) > 20 and len(thrown) % 2 == 0  # as often here as there
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name, kwargs", [(name, {}) for name in NAMES] + KWARGS)
+@pytest.mark.parametrize("name, kwargs", [(name, {}) for name in (*NAMES, FLAGRUN)] + KWARGS)
 def test_equals_gymnasium_over_full_episodes(name: str, kwargs: dict) -> None:
     """Every task to its own time limit, or through tens of falls."""
     ends = assert_equals_gymnasium(name, kwargs, steps=1030)
     assert ends >= 3 if kwargs == {} else ends >= 1
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, FLAGRUN])
 def test_a_restored_environment_goes_on_bit_for_bit(name: str) -> None:
     envs, again = (in_process_envs(name, {}, SEEDS, "auto") for _ in range(2))
     actions = wide_actions(envs, 60, seed=2)

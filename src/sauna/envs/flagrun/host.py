@@ -31,6 +31,8 @@ class HumanoidFlagrunHarder(gymnasium.Env):
         "render_fps": round(1 / rules.CONTROL_DT),
     }
 
+    frame_skip = rules.SUBSTEPS
+
     def __init__(self, render_mode: str | None = None) -> None:
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces()

@@ -18,6 +18,7 @@ from sauna.envs.flagrun.task import (
     Robot,
     Start,
     Throw,
+    components,
 )
 
 MODEL = Path(__file__).parent / "humanoid.xml"
@@ -58,22 +59,23 @@ def anatomy(model: Any) -> Anatomy:
 
 
 def read_robot(xp: Any, body: Anatomy, qpos: Array, qvel: Array, data: Any) -> Robot:
-    """The robot; `data` holds the places of bodies and geoms that belong to `qpos`.
+    """The robot, or many; `data` holds the places of bodies and geoms that belong to `qpos`.
 
     A foot touches the ground where its lowest point is below it.
     """
-    x, y = xp.mean(data.xpos[body.bodies, :2], axis=0)
-    position = xp.stack([x, y, qpos[2]])
-    joints = 2 * (qpos[JOINT] - body.low) / (body.high - body.low) - 1
-    steepness = data.geom_xmat.reshape(-1, 9)[body.feet, 8]  # of a capsule's axis
+    x, y = components(xp.mean(data.xpos[..., body.bodies, :2], axis=-2))
+    position = xp.stack([x, y, qpos[..., 2]], axis=-1)
+    joints = 2 * (qpos[..., JOINT] - body.low) / (body.high - body.low) - 1
+    turned = data.geom_xmat.reshape(*qpos.shape[:-1], -1, 9)
+    steepness = turned[..., body.feet, 8]  # of a capsule's axis
     reach = body.foot_radius + body.foot_half_length * xp.abs(steepness)
-    touches = data.geom_xpos[body.feet, 2] < reach
+    touches = data.geom_xpos[..., body.feet, 2] < reach
     return Robot(
         position,
-        qpos[QUATERNION],
-        qvel[VELOCITY],
+        qpos[..., QUATERNION],
+        qvel[..., VELOCITY],
         joints,
-        JOINT_SPEED_SCALE * qvel[JOINT_VELOCITY],
+        JOINT_SPEED_SCALE * qvel[..., JOINT_VELOCITY],
         xp.where(touches, xp.ones_like(reach), xp.zeros_like(reach)),
     )
 

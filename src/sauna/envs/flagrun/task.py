@@ -2,7 +2,8 @@
 
 Every function works on numpy and on jax.numpy arrays alike: it takes the module of its arrays as
 `xp` and branches on no value. Whatever is random arrives as numbers in [0, 1) that the caller drew,
-so that a host's generator and a device's key serve the same functions.
+so that a host's generator and a device's key serve the same functions. A shape that begins with
+`...` is that of one robot, or of many: `[3]` or `[M, 3]`.
 
 The task is Roboschool's (Schulman et al. 2017, section 6.2), read from its first release and from
 its port to Bullet; `docs/reference/flagrun.md` lists where this one differs.
@@ -67,25 +68,25 @@ Array = Any  # of numpy or of jax.numpy
 class Robot(NamedTuple):
     """What the task reads of the physics."""
 
-    position: Array  # [3] mean x and y of the bodies, z of the torso
-    quaternion: Array  # [4] of the torso: w, x, y, z
-    velocity: Array  # [3] of the torso, in the world
-    joints: Array  # [17] positions, -1 to 1 within their ranges
-    joint_speeds: Array  # [17] scaled by JOINT_SPEED_SCALE
-    feet: Array  # [2] 1 where the foot (right, left) touches the ground, else 0
+    position: Array  # [..., 3] mean x and y of the bodies, z of the torso
+    quaternion: Array  # [..., 4] of the torso: w, x, y, z
+    velocity: Array  # [..., 3] of the torso, in the world
+    joints: Array  # [..., 17] positions, -1 to 1 within their ranges
+    joint_speeds: Array  # [..., 17] scaled by JOINT_SPEED_SCALE
+    feet: Array  # [..., 2] 1 where the foot (right, left) touches the ground, else 0
 
 
 class Task(NamedTuple):
     """What the task itself remembers of an episode."""
 
-    frame: Array  # [] int32, control steps taken
-    ground: Array  # [] int32, the on-ground counter
-    flag: Array  # [2] x, y
-    flag_age: Array  # [] int32, control steps since it was placed
-    potential: Array  # [] float
-    crawling: Array  # [] bool, whether the torso was below UPRIGHT_Z
-    crawl_start: Array  # [] float, the potential to which a crawling robot is held
-    crawl_ignored: Array  # [] float, progress made by crawling, never paid
+    frame: Array  # [...] int32, control steps taken
+    ground: Array  # [...] int32, the on-ground counter
+    flag: Array  # [..., 2] x, y
+    flag_age: Array  # [...] int32, control steps since it was placed
+    potential: Array  # [...] float
+    crawling: Array  # [...] bool, whether the torso was below UPRIGHT_Z
+    crawl_start: Array  # [...] float, the potential to which a crawling robot is held
+    crawl_ignored: Array  # [...] float, progress made by crawling, never paid
 
 
 class Start(NamedTuple):
@@ -110,20 +111,20 @@ class Reward(NamedTuple):
 class Throw(NamedTuple):
     """The cube, where it is thrown."""
 
-    now: Array  # [] bool
-    position: Array  # [3]
-    velocity: Array  # [3]
+    now: Array  # [...] bool
+    position: Array  # [..., 3]
+    velocity: Array  # [..., 3]
 
 
 class Outcome(NamedTuple):
     """What a control step leads to."""
 
     task: Task
-    observation: Array  # [44]
+    observation: Array  # [..., 44]
     reward: Reward
     throw: Throw  # to be carried out before the next step
-    terminated: Array  # [] bool
-    truncated: Array  # [] bool, and not terminated
+    terminated: Array  # [...] bool
+    truncated: Array  # [...] bool, and not terminated
 
 
 def start(xp: Any, draws: Array) -> Start:
@@ -140,14 +141,25 @@ def start(xp: Any, draws: Array) -> Start:
     return Start(position, quaternion, joints, place_flag(xp, draws[-2:]))
 
 
+def over_rows(xp: Any, condition: Array, then: Array, otherwise: Array) -> Array:
+    """`where` with a condition `[...]` for parts `[...]` or `[..., K]`."""
+    whole = xp.ndim(then) == xp.ndim(condition)
+    return xp.where(condition if whole else condition[..., None], then, otherwise)
+
+
 def place_flag(xp: Any, draws: Array) -> Array:
-    """A place for the flag `[2]`, uniform in the field; `draws` `[2]`."""
+    """A place for the flag `[..., 2]`, uniform in the field; `draws` `[..., 2]`."""
     return xp.asarray(FLAG_HALF_LENGTHS, dtype=draws.dtype) * (2 * draws - 1)
+
+
+def components(vectors: Array) -> tuple[Array, ...]:
+    """The numbers of vectors `[..., K]`, each `[...]`."""
+    return tuple(vectors[..., k] for k in range(vectors.shape[-1]))
 
 
 def roll_pitch_yaw(xp: Any, quaternion: Array) -> tuple[Array, Array, Array]:
     """Angles about x, y and z, applied in that order, as Bullet reads them."""
-    w, x, y, z = quaternion
+    w, x, y, z = components(quaternion)
     sine = 2 * (w * y - z * x)
     gimbal = xp.abs(sine) >= GIMBAL_SINE
     sign = xp.where(sine < 0, -1.0, 1.0)
@@ -159,14 +171,14 @@ def roll_pitch_yaw(xp: Any, quaternion: Array) -> tuple[Array, Array, Array]:
 
 
 def observe(xp: Any, robot: Robot, flag: Array) -> Array:
-    """The observation `[44]`."""
+    """The observation `[..., 44]`."""
     roll, pitch, yaw = roll_pitch_yaw(xp, robot.quaternion)
     cos, sin = xp.cos(yaw), xp.sin(yaw)
-    to_flag = flag - robot.position[:2]
-    angle = xp.arctan2(to_flag[1], to_flag[0]) - yaw
-    vx, vy, vz = robot.velocity
+    to_flag = flag - robot.position[..., :2]
+    angle = xp.arctan2(to_flag[..., 1], to_flag[..., 0]) - yaw
+    vx, vy, vz = components(robot.velocity)
     body = [
-        robot.position[2] - UPRIGHT_Z,
+        robot.position[..., 2] - UPRIGHT_Z,
         xp.sin(angle),
         xp.cos(angle),
         VELOCITY_SCALE * (cos * vx + sin * vy),
@@ -175,14 +187,15 @@ def observe(xp: Any, robot: Robot, flag: Array) -> Array:
         roll,
         pitch,
     ]
-    joints = xp.stack([robot.joints, robot.joint_speeds], axis=1).reshape(-1)
-    observation = xp.concatenate([xp.stack(body), joints, robot.feet])
+    joints = xp.stack([robot.joints, robot.joint_speeds], axis=-1)
+    joints = joints.reshape(*robot.joints.shape[:-1], 2 * JOINTS)
+    observation = xp.concatenate([xp.stack(body, axis=-1), joints, robot.feet], axis=-1)
     return xp.clip(observation, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
 
 def flag_distance(xp: Any, robot: Robot, flag: Array) -> Array:
-    to_flag = flag - robot.position[:2]
-    return xp.sqrt(to_flag[0] ** 2 + to_flag[1] ** 2)
+    dx, dy = components(flag - robot.position[..., :2])
+    return xp.sqrt(dx**2 + dy**2)
 
 
 def alive_bonus(xp: Any, z: Array) -> Array:
@@ -197,12 +210,13 @@ def with_potential(xp: Any, task: Task, robot: Robot) -> Task:
     and what was crawled is subtracted for the rest of the episode.
     """
     progress = -flag_distance(xp, robot, task.flag) / CONTROL_DT
-    down = robot.position[2] < UPRIGHT_Z
+    z = robot.position[..., 2]
+    down = z < UPRIGHT_Z
     begins = xp.logical_and(down, xp.logical_not(task.crawling))
     crawl_start = xp.where(begins, progress - task.crawl_ignored, task.crawl_start)
     ignored = xp.where(down, progress - crawl_start, task.crawl_ignored)
     paid = progress - ignored
-    potential = paid + POTENTIAL_OF_ALIVE * alive_bonus(xp, robot.position[2])
+    potential = paid + POTENTIAL_OF_ALIVE * alive_bonus(xp, z)
     return task._replace(
         potential=potential, crawling=down, crawl_start=crawl_start, crawl_ignored=ignored
     )
@@ -210,36 +224,38 @@ def with_potential(xp: Any, task: Task, robot: Robot) -> Task:
 
 def begin(xp: Any, robot: Robot, flag: Array) -> tuple[Task, Array]:
     """The task at an episode's first state, and the first observation."""
-    none, zero = xp.asarray(0, dtype=xp.int32), 0.0 * robot.position[2]
-    standing = xp.asarray(False)
+    zero = 0.0 * robot.position[..., 2]
+    none, standing = xp.zeros_like(zero, dtype=xp.int32), xp.zeros_like(zero, dtype=bool)
     task = Task(none, none, flag, none, zero, standing, zero, zero)
     return with_potential(xp, task, robot), observe(xp, robot, flag)
 
 
 def moved_flag(xp: Any, task: Task, robot: Robot, draws: Array) -> Task:
-    """The flag somewhere else where it was reached or missed for too long; `draws` `[2]`.
+    """The flag somewhere else where it was reached or missed for too long; `draws` `[..., 2]`.
 
     The potential is taken anew there, so that a step that moves the flag pays no progress.
     """
     reached = flag_distance(xp, robot, task.flag) < FLAG_REACHED
     moves = xp.logical_or(reached, task.flag_age >= FLAG_STEPS)
     age = xp.where(moves, xp.zeros_like(task.flag_age), task.flag_age)
-    moved = task._replace(flag=xp.where(moves, place_flag(xp, draws), task.flag), flag_age=age)
+    flag = over_rows(xp, moves, place_flag(xp, draws), task.flag)
+    moved = task._replace(flag=flag, flag_age=age)
     fresh = with_potential(xp, moved, robot)
-    return Task(*(xp.where(moves, new, old) for new, old in zip(fresh, moved, strict=True)))
+    return Task(*(over_rows(xp, moves, *parts) for parts in zip(fresh, moved, strict=True)))
 
 
 def throw(xp: Any, task: Task, robot: Robot, draws: Array) -> Throw:
-    """The cube, aimed at where the robot will be when it arrives; `draws` `[5]`."""
+    """The cube, aimed at where the robot will be when it arrives; `draws` `[..., 5]`."""
     due = xp.logical_and(task.frame % THROW_EVERY == 0, task.frame > THROW_AFTER)
     now = xp.logical_and(due, task.ground == 0)
-    angle = xp.pi * (2 * draws[0] - 1)
-    speed = THROW_SPEED[0] + (THROW_SPEED[1] - THROW_SPEED[0]) * draws[1]
+    angle = xp.pi * (2 * draws[..., 0] - 1)
+    speed = THROW_SPEED[0] + (THROW_SPEED[1] - THROW_SPEED[0]) * draws[..., 1:2]
     target = robot.position + robot.velocity * (THROW_DISTANCE / speed)
     height = xp.full_like(angle, THROW_HEIGHT)
-    away = xp.stack([THROW_DISTANCE * xp.cos(angle), THROW_DISTANCE * xp.sin(angle), height])
+    around = [THROW_DISTANCE * xp.cos(angle), THROW_DISTANCE * xp.sin(angle)]
+    away = xp.stack([*around, height], axis=-1)
     straight = -away * (speed / math.hypot(THROW_DISTANCE, THROW_HEIGHT))
-    return Throw(now, target + away, straight + THROW_NOISE * (2 * draws[2:5] - 1))
+    return Throw(now, target + away, straight + THROW_NOISE * (2 * draws[..., 2:5] - 1))
 
 
 def count_ground(xp: Any, ground: Array, z: Array) -> Array:
@@ -248,28 +264,29 @@ def count_ground(xp: Any, ground: Array, z: Array) -> Array:
 
 
 def costs(xp: Any, robot: Robot, action: Array) -> tuple[Array, Array, Array]:
-    """Electricity, stall torque and joints at their limits; `action` `[17]`, clipped."""
-    electricity = ELECTRICITY * xp.mean(xp.abs(action * robot.joint_speeds))
-    stall_torque = STALL_TORQUE * xp.mean(action * action)
-    at_limit = JOINT_AT_LIMIT * xp.sum(xp.abs(robot.joints) > AT_LIMIT)
+    """Electricity, stall torque and joints at their limits; `action` `[..., 17]`, clipped."""
+    electricity = ELECTRICITY * xp.mean(xp.abs(action * robot.joint_speeds), axis=-1)
+    stall_torque = STALL_TORQUE * xp.mean(action * action, axis=-1)
+    at_limit = JOINT_AT_LIMIT * xp.sum(xp.abs(robot.joints) > AT_LIMIT, axis=-1)
     return electricity, stall_torque, at_limit
 
 
 def advance(xp: Any, task: Task, robot: Robot, action: Array, draws: Array) -> Outcome:
-    """What the physics' control step with `action` led to; `draws` `[STEP_DRAWS]`.
+    """What the physics' control step with `action` led to; `draws` `[..., STEP_DRAWS]`.
 
     A state that is not finite ends the episode, as in both ports, and is shown as zeros.
     """
-    finite = xp.isfinite(sum(xp.sum(part) for part in robot))
-    robot = Robot(*(xp.where(finite, part, xp.zeros_like(part)) for part in robot))
+    finite = xp.isfinite(sum(xp.sum(part, axis=-1) for part in robot))
+    robot = Robot(*(over_rows(xp, finite, part, xp.zeros_like(part)) for part in robot))
+    z = robot.position[..., 2]
     aged = task._replace(flag_age=task.flag_age + 1)
-    before = moved_flag(xp, aged, robot, draws[:2])
-    thrown = throw(xp, before, robot, draws[2:])
+    before = moved_flag(xp, aged, robot, draws[..., :2])
+    thrown = throw(xp, before, robot, draws[..., 2:])
     after = with_potential(xp, before, robot)
-    ground = count_ground(xp, task.ground, robot.position[2])
+    ground = count_ground(xp, task.ground, z)
     terminated = xp.logical_or(ground >= GROUND_STEPS, xp.logical_not(finite))
     frame = task.frame + 1
-    alive = xp.where(terminated, ALIVE_AT_END, alive_bonus(xp, robot.position[2]))
+    alive = xp.where(terminated, ALIVE_AT_END, alive_bonus(xp, z))
     reward = Reward(alive, after.potential - before.potential, *costs(xp, robot, action))
     return Outcome(
         after._replace(frame=frame, ground=ground),

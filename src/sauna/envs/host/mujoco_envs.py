@@ -1,8 +1,8 @@
-"""Gymnasium's MuJoCo v5 tasks without Gymnasium's cost per step.
+"""MuJoCo's tasks without their cost per step: Gymnasium's v5, and HumanoidFlagrunHarder.
 
 Each environment is Gymnasium's own: it makes the model, draws the resets, and replays episodes.
 Only `step` is short-circuited: `mj_step` on every environment's own `MjData`, then observations,
-rewards and ends of all of them at once; see `mujoco_tasks.py`.
+rewards and ends of all of them at once; see `mujoco_tasks.py` and `flagrun/rows.py`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
+from sauna.envs.flagrun import task as rules
+from sauna.envs.flagrun.host import HumanoidFlagrunHarder
+from sauna.envs.flagrun.rows import FlagrunRows
 from sauna.envs.host.contract import Snapshot, Step
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs, Slot
 from sauna.envs.host.mujoco_tasks import TASKS, Outcome, make_task
@@ -23,19 +26,26 @@ from sauna.system.errors import one_line
 CAPACITY = 1000  # steps of an episode that memory is taken for at the start
 
 
+def is_flagrun(env: Any) -> bool:
+    """Whether it is HumanoidFlagrunHarder itself, without wrappers."""
+    return type(env) is HumanoidFlagrunHarder
+
+
 def time_limit(env: Any) -> int | None:
     """Steps after which `env` is truncated, if it is one that the fast path can step; else None.
 
-    It must be exactly Gymnasium's time limit around one of the eleven tasks: any other wrapper, or
-    a subclass, may do something in `step` that would be lost.
+    It must be exactly Gymnasium's time limit around one of the eleven tasks, or the flag run, which
+    keeps its own: any other wrapper, or a subclass, may do something in `step` that would be lost.
     """
+    if type(env) is OrderEnforcing and is_flagrun(env.env):
+        return rules.TIME_LIMIT
     if type(env) is not TimeLimit or type(env.env) is not OrderEnforcing:
         return None
     return env._max_episode_steps if type(env.env.env) in TASKS else None
 
 
 class MujocoEnvs(GymnasiumEnvs):
-    """M environments of one of the eleven tasks, stepped fast.
+    """M environments of one of these tasks, stepped fast.
 
     Args:
       make: makes one environment, which `time_limit` must accept.
@@ -47,7 +57,7 @@ class MujocoEnvs(GymnasiumEnvs):
         limit = time_limit(self._slots[0].env)
         assert limit is not None
         envs = [slot.env.unwrapped for slot in self._slots]
-        self._task = make_task(envs)
+        self._task = FlagrunRows(envs) if is_flagrun(envs[0]) else make_task(envs)
         self._limit, self._over = limit, False
         self._low, self._high = envs[0].action_space.low, envs[0].action_space.high
         self._clipped = np.zeros((len(envs), len(self._low)), np.float32)

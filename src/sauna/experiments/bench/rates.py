@@ -92,11 +92,11 @@ def simulator(env: str) -> str | None:
     """Returns what steps an environment: `raw mj_step`, `ale-py alone`, or None where it is not
     known."""
     from sauna.envs.host.atari_envs import is_atari
-    from sauna.envs.make import is_mujoco
+    from sauna.envs.make import steps_mujoco
 
     if is_atari(env):
         return "ale-py alone"
-    return "raw mj_step" if is_mujoco(env) else None
+    return "raw mj_step" if steps_mujoco(env) else None
 
 
 def physics_rate(env: str, env_kwargs: Mapping[str, Any], processes: int, seconds: float) -> float:

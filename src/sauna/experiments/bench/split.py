@@ -26,7 +26,7 @@ from sauna.envs.host import mujoco_tasks
 from sauna.envs.host.atari_envs import AtariEnvs
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.host.mujoco_tasks import BatchTask
-from sauna.envs.make import is_mujoco
+from sauna.envs.make import steps_mujoco
 from sauna.system.checkpoint import save_checkpoint
 from sauna.training.loop import budget, host
 from sauna.training.loop.member_state import Counters
@@ -152,7 +152,7 @@ def _physics(envs: Any, env: str) -> tuple[Any, str]:
 
     Of an environment whose simulator is not known, that is its own `step`.
     """
-    if isinstance(envs, AtariEnvs) or (type(envs) is GymnasiumEnvs and not is_mujoco(env)):
+    if isinstance(envs, AtariEnvs) or (type(envs) is GymnasiumEnvs and not steps_mujoco(env)):
         return envs, "_take"
     if isinstance(getattr(envs, "_task", None), BatchTask):
         return mujoco_tasks, "_advance"

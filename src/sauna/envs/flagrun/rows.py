@@ -1,0 +1,84 @@
+"""Many HumanoidFlagrunHarder on a CPU: one physics after the other, the rules of all at once."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from sauna.envs.flagrun import task as rules
+from sauna.envs.flagrun.physics import after_throw, anatomy, read_robot
+from sauna.envs.host.mujoco_tasks import Outcome, Task
+
+
+class Seen(NamedTuple):
+    """What the rules read of one environment's physics, or of many: `[...]` is nothing or M."""
+
+    qpos: np.ndarray  # [..., nq]
+    qvel: np.ndarray  # [..., nv]
+    xpos: np.ndarray  # [..., bodies, 3] m
+    geom_xmat: np.ndarray  # [..., geoms, 9]
+    geom_xpos: np.ndarray  # [..., geoms, 3] m
+
+
+class FlagrunRows(Task):
+    """M environments of `sauna/HumanoidFlagrunHarder-v0`; their own `step` gives the same bits.
+
+    Args:
+      envs: without wrappers, made alike. They draw what is random, and begin episodes.
+    """
+
+    def __init__(self, envs: list[Any]) -> None:
+        super().__init__(envs)
+        self._anatomy = anatomy(envs[0].model)
+        # One model serves all, as in `BatchTask`. A view of an environment's physics stays valid.
+        self._model, self._datas = envs[0].model, [env.data for env in envs]
+        self._views = [
+            Seen(*(getattr(data, name) for name in Seen._fields)) for data in self._datas
+        ]
+        self._seen = Seen(*map(np.stack, zip(*self._views, strict=True)))
+        self._draws = np.zeros((len(envs), rules.STEP_DRAWS))
+        idle = rules.Robot(*(np.zeros((len(envs), n)) for n in (3, 4, 3, 17, 17, 2)))
+        first, _ = rules.begin(np, idle, np.zeros((len(envs), 2)))
+        self._tasks = rules.Task(*map(np.array, first))
+        self._rows, self._reward = np.arange(0), rules.Reward(*[np.zeros(0)] * 5)
+
+    def gather(self, index: int) -> None:
+        for mine, its in zip(self._tasks, self.envs[index].task, strict=True):
+            mine[index] = its
+
+    def step(self, active: np.ndarray, action: np.ndarray, out: Outcome) -> None:
+        rows = np.flatnonzero(active)
+        if len(rows) == 0:
+            return
+        control = action[rows].astype(np.float64)
+        for row, its in zip(rows.tolist(), control, strict=True):
+            self._simulate(row, its)
+        seen, tasks = (type(of)(*(part[rows] for part in of)) for of in (self._seen, self._tasks))
+        robots = read_robot(np, self._anatomy, seen.qpos, seen.qvel, seen)
+        outcome = rules.advance(np, tasks, robots, control, self._draws[rows])
+        for mine, new in zip(self._tasks, outcome.task, strict=True):
+            mine[rows] = new
+        for k in np.flatnonzero(outcome.throw.now):
+            thrown = rules.Throw(*(part[k] for part in outcome.throw))
+            view = self._views[rows[k]]
+            view.qpos[:], view.qvel[:] = after_throw(np, thrown, view.qpos, view.qvel)
+        out.observation[rows] = outcome.observation.astype(np.float32)
+        out.reward[rows] = sum(outcome.reward)
+        out.terminated[rows] = outcome.terminated
+        self._rows, self._reward = rows, outcome.reward
+
+    def _simulate(self, row: int, control: np.ndarray) -> None:
+        """Draws what a step needs, takes it, and notes what is seen then; see the environment."""
+        self._draws[row] = self.envs[row].np_random.random(rules.STEP_DRAWS)
+        data = self._datas[row]
+        data.ctrl[:] = control
+        mujoco.mj_step(self._model, data, nstep=rules.SUBSTEPS)
+        mujoco.mj_kinematics(self._model, data)
+        for all_rows, its in zip(self._seen, self._views[row], strict=True):
+            all_rows[row] = its
+
+    def info(self, index: int, action: np.ndarray) -> dict[str, Any]:
+        row = int(np.searchsorted(self._rows, index))
+        return {name: float(term[row]) for name, term in self._reward._asdict().items()}
