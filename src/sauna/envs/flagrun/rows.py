@@ -55,7 +55,8 @@ class FlagrunRows(Task):
         control = action[rows].astype(np.float64)
         for row, its in zip(rows.tolist(), control, strict=True):
             self._simulate(row, its)
-        seen, tasks = (type(of)(*(part[rows] for part in of)) for of in (self._seen, self._tasks))
+        seen = Seen(*(part[rows] for part in self._seen))
+        tasks = rules.Task(*(part[rows] for part in self._tasks))
         robots = read_robot(np, self._anatomy, seen.qpos, seen.qvel, seen)
         outcome = rules.advance(np, tasks, robots, control, self._draws[rows])
         for mine, new in zip(self._tasks, outcome.task, strict=True):
