@@ -61,10 +61,7 @@ class FlagrunRows(Task):
         outcome = rules.advance(np, tasks, robots, control, self._draws[rows])
         for mine, new in zip(self._tasks, outcome.task, strict=True):
             mine[rows] = new
-        for k in np.flatnonzero(outcome.throw.now):
-            thrown = rules.Throw(*(part[k] for part in outcome.throw))
-            view = self._views[rows[k]]
-            view.qpos[:], view.qvel[:] = after_throw(np, thrown, view.qpos, view.qvel)
+        self._throw(rows, outcome.throw)
         out.observation[rows] = outcome.observation.astype(np.float32)
         out.reward[rows] = sum(outcome.reward)
         out.terminated[rows] = outcome.terminated
@@ -79,6 +76,12 @@ class FlagrunRows(Task):
         mujoco.mj_kinematics(self._model, data)
         for all_rows, its in zip(self._seen, self._views[row], strict=True):
             all_rows[row] = its
+
+    def _throw(self, rows: np.ndarray, throw: rules.Throw) -> None:
+        """Puts the cubes that are thrown where they are thrown from."""
+        for k in np.flatnonzero(throw.now):
+            thrown, its = rules.Throw(*(part[k] for part in throw)), self._views[rows[k]]
+            its.qpos[:], its.qvel[:] = after_throw(np, thrown, its.qpos, its.qvel)
 
     def info(self, index: int, action: np.ndarray) -> dict[str, Any]:
         row = int(np.searchsorted(self._rows, index))
