@@ -13,6 +13,7 @@ from sauna.config.presets import PRESETS
 from sauna.config.settings import NATIVE
 from sauna.config.zoo import ENVS
 from sauna.experiments.listing import listing
+from sauna.experiments.study.spec import built_in
 
 
 def test_environments_stand_beside_their_preset_steps_and_published_return() -> None:
@@ -53,3 +54,12 @@ def test_rules_stand_beside_the_share_that_their_sampler_has() -> None:
     assert {name: share for name, share in defaults.items() if share is not None} == SHARES
     (kondo,) = (line for line in listing("rules") if line.startswith("kondo"))
     assert kondo.split()[:3] == ["kondo", "rollout", "0.3"]
+
+
+def test_studies_are_listed_by_a_sentence_each() -> None:
+    lines = listing("studies")
+    assert [line.split()[0] for line in lines] == list(built_in())
+    starts = {len(line) - len(line.split(maxsplit=1)[1]) for line in lines}
+    assert len(starts) == 1 and all(line.endswith((".", "?")) for line in lines)
+    (fig2,) = (line for line in lines if line.startswith("fig2 "))
+    assert fig2.endswith("  The paper's Fig. 2: the learning curves of Table 1.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Iterator
 
 from sauna.config.arms import SHARES
@@ -46,13 +48,23 @@ def listing(what: str | None) -> list[str]:
     if what == "rules":
         return list(_rules())
     if what == "studies":
-        from sauna.experiments.study.spec import built_in
-
-        texts = ((name, text.splitlines()[0]) for name, text in built_in().items())
-        return [f"{name:10} {first.removeprefix('# ')}" for name, first in texts]
+        return list(_studies())
     width = max(map(len, HELP[what]))
     lines = [f"{name:{width}}  {text}" for name, text in HELP[what].items()]
     return lines + (["", "What `sauna train ENV` takes:", *_zoo()] if what == "presets" else [])
+
+
+def _studies() -> Iterator[str]:
+    """The built-in studies, each with the first sentence of its comment."""
+    from sauna.experiments.study.spec import built_in
+
+    texts = built_in()
+    width = max(map(len, texts))
+    for name, text in texts.items():
+        comment = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+        words = " ".join(line.removeprefix("# ") for line in comment)
+        sentence = re.match(r".+?[.?](?= [A-Z]|$)", words)
+        yield f"{name:{width}}  {sentence[0] if sentence else words}"
 
 
 def _policies() -> Iterator[str]:

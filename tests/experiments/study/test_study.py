@@ -194,6 +194,7 @@ def test_studies_of_the_paper(name: str) -> None:
         config = check(arm, spec.tasks[0])
         steps = 10**8 if name.startswith("fig4") else 10**6
         others = {"minatar": 3 * 10**6, "selection-pilot-hopper": 3 * 10**5}
+        others |= {"fig4a-cpu": 2 * 10**7, "fig4b-cpu": 10**7, "fig4c-cpu": 10**7}
         assert config.steps == others.get(name, steps)
         # Only the filter may differ from the baseline: the same rules of truncation and budget.
         if arm.baseline and not arm.label.startswith("ppo"):
@@ -207,11 +208,12 @@ def test_studies_of_the_paper(name: str) -> None:
         assert {len(a.seeds) for a in spec.arms} == {6} and len(spec.tasks) == 6
 
 
-def test_the_papers_three_settings_of_flagrun() -> None:
+@pytest.mark.parametrize("place, backend", [("", "device"), ("-cpu", "auto")])
+def test_the_papers_three_settings_of_flagrun(place: str, backend: str) -> None:
     found = {}
     for name in ("fig4a", "fig4b", "fig4c"):
-        config = check(load_spec(name).arms[0], "sauna/HumanoidFlagrunHarder-v0")
-        assert config.backend == "device" and config.rollout_steps == 512
+        config = check(load_spec(name + place).arms[0], "sauna/HumanoidFlagrunHarder-v0")
+        assert config.backend == backend and config.rollout_steps == 512
         assert config.envs * config.rollout_steps // config.minibatches == 4096
         found[name] = (config.hidden, config.envs)
     wide = (512, 256, 128)
