@@ -100,11 +100,11 @@ def screen_answer() -> str | None:
     ]
     better = [f"`{label}`" for label, found in cells.items() if _is_better(found.values())]
     worse = [x for x, found in cells.items() if any(c.word == "worse" for c in found.values())]
-    part = f" and a part of {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""
+    part = f", some on {len(tasks) - len(whole)} more" if len(tasks) > len(whole) else ""
     gains = f"better on a task: {', '.join(better)}" if better else "no rule beats `ppo`"
     return (
-        f"**not decided** after {_seeds(studies)} on {len(whole)} of {len(planned)} tasks{part}. "
-        f"By the intervals {gains}, and {len(worse)} of {len(cells)} scored worse on a task"
+        f"**not decided**. All rules are trained on {len(whole)} of {len(planned)} tasks{part}, "
+        f"with {_seeds(studies)}. By the intervals {gains}, and {len(worse)} of {len(cells)} scored worse on a task"
     )
 
 

@@ -52,11 +52,11 @@ _PLACE: dict[str, dict[str, Any]] = {
     },
     "address": {
         "default": "",
-        "help": "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: a Ray of our own)",
+        "help": "of a Ray cluster: HOST:PORT, ray://HOST:PORT or auto (default: start one here)",
     },
     "accept_changed_code": {
         "action": "store_true",
-        "help": "go on with runs whose environment's or plug-in's code is not what it was",
+        "help": "go on with runs although the code of their environment or plug-in has changed",
     },
 }
 
@@ -113,7 +113,7 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
         text = "each member as it was at its best evaluation during training"
         command.add_argument("--best", action="store_true", help=text)
 
-    text = "one page: an episode, what the Vex head says of it, what today's rule takes of it"
+    text = "a page about one episode: what the Vex head predicts, which steps the rule keeps"
     inspect = commands.add_parser("inspect", help=text, allow_abbrev=False)
     inspect.add_argument("--member", help="name (sauna/0) or index; default: the first")
     inspect.add_argument("--episodes", default="1", help="how many, in a row (default 1)")

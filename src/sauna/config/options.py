@@ -37,7 +37,8 @@ class Config(RunOptions):
     )
     learning_rate_schedule: str = _learning(
         "linear",
-        "over the budget of steps: to 0, constant, as a function says, or held by the KL (kl)",
+        "of the learning rate over the budget: to 0 (linear, cosine), constant, by the KL divergence "
+        "(kl), or by a function",
         choices=("linear", "constant", "cosine", "kl"),
         plugin=True,
     )
@@ -50,8 +51,8 @@ class Config(RunOptions):
     )
     desired_kl: float = _learning(
         0.01,
-        "the KL divergence that schedule kl holds: above twice of it the rate is divided by 1.5, "
-        "below half of it multiplied",
+        "KL divergence that schedule kl aims at: above twice of it the rate is divided by 1.5, "
+        "below half of it the rate is multiplied by 1.5",
         above=0,
         read_when=readers.KL_RATE,
     )
@@ -70,7 +71,7 @@ class Config(RunOptions):
     optimizer_kwargs: str = _learning("{}", "arguments of the optimizer, as a JSON object")
     weight_decay: float = _learning(
         0.0,
-        "share of each parameter taken off in a step, times the learning rate (0: what the "
+        "a gradient step subtracts this times the learning rate of each parameter (0: what the "
         "optimizer does by itself)",
         at_least=0,
     )
@@ -103,7 +104,7 @@ class Config(RunOptions):
     )
     clip_range_schedule: str = _learning(
         "constant",
-        "over the budget of steps: constant, to 0 (linear, cosine), or a factor of your own",
+        "of the clip range over the budget: constant, to 0 (linear, cosine), or by a function",
         choices=choices.SCHEDULES,
         plugin=True,
         read_when=readers.PPO,
@@ -119,7 +120,7 @@ class Config(RunOptions):
     )
     entropy_coef_schedule: str = _learning(
         "constant",
-        "as the clip range's",
+        "of the entropy bonus over the budget: constant, to 0 (linear, cosine), or by a function",
         choices=choices.SCHEDULES,
         plugin=True,
         read_when=readers.ENTROPY,
@@ -144,7 +145,7 @@ class Config(RunOptions):
     )
     layer_norm: bool = _network(
         False,
-        "normalise what each layer of the MLP adds up (Ba et al. 2016), before its activation",
+        "normalise each layer of the MLP before its activation (Ba et al. 2016)",
         read_when=readers.MLP,
     )
     value_hidden: tuple[int, ...] = _network(
@@ -245,8 +246,8 @@ class Config(RunOptions):
     )
     control: str = _selection(
         "none",
-        "instead of what the rule takes, as many samples in each iteration: at random, every "
-        "k-th, those of smallest |advantage|, or those that the rule wants least",
+        "replaces the rule's samples by as many others in each iteration: at random, every k-th, "
+        "those of smallest |advantage|, or those that the rule wants least",
         choices=("none", "random", "stride", "low-advantage", "reversed"),
     )
     selection_mode: str = _selection(
@@ -316,8 +317,8 @@ class Config(RunOptions):
     )
     auxiliary: str = _update(
         "none",
-        "a head that is trained along to predict the next observation, or, as MERL's released "
-        "code does, that of another row",
+        "a second head learns to predict the next observation, or, as in MERL's released code, "
+        "that of another row",
         choices=("none", "next-observation", "shuffled-observation"),
     )
     auxiliary_coef: float = _update(

@@ -52,7 +52,7 @@ class RunOptions:
     )
     preset: str = _run(
         "mujoco",
-        "settings to start from, see `sauna list presets`; auto: those of the environment, as "
+        "settings to start from, see `sauna list presets`; auto: the environment's own, which "
         "`train` takes if none is named (with A2C: a2c)",
         common=True,
     )
@@ -102,7 +102,7 @@ class RunOptions:
     )
     reset: str = _where(
         "fresh",
-        "on the device, an episode starts in a new state, or in its environment's first one again",
+        "on the device: an episode starts in a new state (fresh), or in the first of its environment",
         choices=("fresh", "cached"),
         shapes_program=True,
         device_only=True,

@@ -12,7 +12,7 @@ STEPS = 1000
 
 def add_command(commands: Any) -> None:
     """Adds the command to the subparsers of `sauna`."""
-    text = "what is wrong with an environment, and how it is mended"
+    text = "what is wrong with an environment, and how to mend it"
     check = commands.add_parser("check", help=text, allow_abbrev=False)
     text = "Gymnasium id, or module:function that makes an environment"
     check.add_argument("env", metavar="ENV", help=text)

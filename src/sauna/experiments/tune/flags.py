@@ -17,8 +17,8 @@ _TUNING: dict[str, dict[str, Any]] = {
     "trials": {
         "default": "50",
         "metavar": "INT",
-        "help": "settings to try, those of before included (default 50); of a population its "
-        "members",
+        "help": "settings to try, with those that were tried before (default 50); with "
+        "--population-based, the members",
     },
     "space": {
         "default": "",
