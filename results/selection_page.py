@@ -104,7 +104,8 @@ def screen_answer() -> str | None:
     gains = f"better on a task: {', '.join(better)}" if better else "no rule beats `ppo`"
     return (
         f"**not decided**. All rules are trained on {len(whole)} of {len(planned)} tasks{part}, "
-        f"with {_seeds(studies)}. By the intervals {gains}, and {len(worse)} of {len(cells)} scored worse on a task"
+        f"with {_seeds(studies)}. By the intervals {gains}, and {len(worse)} of {len(cells)} "
+        "scored worse on a task"
     )
 
 

@@ -37,8 +37,8 @@ class Config(RunOptions):
     )
     learning_rate_schedule: str = _learning(
         "linear",
-        "of the learning rate over the budget: to 0 (linear, cosine), constant, by the KL divergence "
-        "(kl), or by a function",
+        "of the learning rate over the budget: to 0 (linear, cosine), constant, by the KL "
+        "divergence (kl), or by a function",
         choices=("linear", "constant", "cosine", "kl"),
         plugin=True,
     )

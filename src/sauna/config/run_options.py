@@ -102,7 +102,7 @@ class RunOptions:
     )
     reset: str = _where(
         "fresh",
-        "on the device: an episode starts in a new state (fresh), or in the first of its environment",
+        "on the device: an episode starts in a new state, or in the first of its environment",
         choices=("fresh", "cached"),
         shapes_program=True,
         device_only=True,
