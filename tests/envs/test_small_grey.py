@@ -52,6 +52,14 @@ def test_other_observations_are_refused_in_a_line() -> None:
     assert "\n" not in str(error.value)
 
 
+def test_a_video_of_it_is_as_fast_as_the_game() -> None:
+    assert "render_fps" not in SmallGrey(Colours()).metadata
+    colours = Colours()
+    colours.metadata = {"render_fps": 50}
+    assert SmallGrey(colours).metadata["render_fps"] == 25
+    assert colours.metadata["render_fps"] == 50
+
+
 def test_nobody_has_to_trust_it_and_pictures_can_be_stacked() -> None:
     assert named_code({"config": {"wrap": [PATH], "env": PATH}}) == [["env", PATH]]
     env = wrapped(Colours(), Wrapping((PATH,), 2))

@@ -42,6 +42,8 @@ class SmallGrey(gymnasium.Wrapper[Any, Any, Any, Any]):
         if space.dtype != np.uint8 or len(space.shape) != 3 or space.shape[2] != 3:
             raise ValueError(f"its observations are no pictures [H, W, 3] of bytes: {space}")
         self.observation_space = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 1), np.uint8)
+        if "render_fps" in env.metadata:  # a video has a frame of each env step
+            self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / self.times}
         self._rows = shares(space.shape[0], SIDE)
         self._columns = shares(space.shape[1], SIDE).T
 
