@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sauna.config.presets import AUTO, resolve
-from sauna.config.trust import named_code
+from sauna.config.task_presets import TASK_PRESETS
+from sauna.config.trust import OWN_WRAPPERS, named_code
 from sauna.envs.car_racing import EveryEighth
 from sauna.envs.make import make_env
 from sauna.envs.small_grey import SIDE, SmallGrey
@@ -60,6 +61,8 @@ def test_another_environment_is_refused_in_a_line() -> None:
 def test_the_preset_takes_it_and_nobody_has_to_trust_it() -> None:
     config = resolve({"env": "CarRacing-v3", "preset": AUTO})
     assert wrapping_of(config) == Wrapping((PATH,), 4)
+    wrappers = {path for preset in TASK_PRESETS.values() for path in preset.get("wrap", ())}
+    assert wrappers <= set(OWN_WRAPPERS)
     assert named_code({"config": {"wrap": [PATH], "env": PATH}}) == [["env", PATH]]
 
 

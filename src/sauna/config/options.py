@@ -71,8 +71,8 @@ class Config(RunOptions):
     optimizer_kwargs: str = _learning("{}", "arguments of the optimizer, as a JSON object")
     weight_decay: float = _learning(
         0.0,
-        "a gradient step subtracts this times the learning rate of each parameter (0: what the "
-        "optimizer does by itself)",
+        "share of each parameter that a gradient step subtracts, times the learning rate (0: what "
+        "the optimizer does by itself)",
         at_least=0,
     )
     schedule_start: int = _learning(

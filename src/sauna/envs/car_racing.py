@@ -1,4 +1,4 @@
-"""CarRacing as it learns in an hour: every eighth picture, small and grey.
+"""CarRacing in every eighth picture, small and grey.
 
 `--wrap sauna.envs.car_racing:EveryEighth` puts it around the environments of a run.
 """
@@ -16,7 +16,7 @@ class EveryEighth(SmallGrey):
     """Shows CarRacing as grey pictures `[64, 64, 1]`; takes each action eight times.
 
     The reward is the sum of the eight. An episode that ends before the eighth ends there.
-    Gymnasium (1.3) draws each picture, which takes three quarters of its time. Pictures that nobody
+    Gymnasium (1.3) draws a picture in each step, which takes most of its time. Pictures that nobody
     sees are not drawn here; the others stay the same to the bit.
 
     Raises:
