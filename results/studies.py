@@ -87,12 +87,12 @@ WHY = {
     "`target-kl` ends an update early (limit 0.01), and one arm takes half of the epochs.",
     "vex-head": "The head helped on two tasks with six seeds, undecided. Thirty seeds that no "
     "other study used decide it.",
-    "fig4a-cpu": "The paper's Figure 4a in a fifth of its env steps. The paper says that SAUNA learns "
-    "faster and scores higher there (section 4.3).",
+    "fig4a-cpu": "The paper's Figure 4a in a fifth of its env steps. The paper says that SAUNA "
+    "learns faster and scores higher there (section 4.3).",
     "fig4b-cpu": "The paper's Figure 4b in a tenth of its env steps. The paper says that SAUNA is "
     "faster at the beginning, and that PPO reaches it later.",
-    "fig4c-cpu": "The paper's Figure 4c in a tenth of its env steps. The paper says that SAUNA learns "
-    "faster and scores higher there.",
+    "fig4c-cpu": "The paper's Figure 4c in a tenth of its env steps. The paper says that SAUNA "
+    "learns faster and scores higher there.",
     "noise": "The paper says that the dropped samples are noisy. The policy gradient of dropped "
     "steps was measured at five checkpoints of each seed.",
     "dial": "The paper says that the threshold trades exploration for exploitation. Thresholds "
