@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from selection_arms import arms
 from selection_stage import stage_of, stage_text
 from selection_standing import planned_of, standing, standing_text
 from selection_trainings import is_control, seeds_said
-from selection_words import Cell, words_of
+from selection_words import Cell, coloured, words_of
 from studies import folded, load, markdown, page
 
+from sauna.config.presets import RANDOM_CONTROL
 from sauna.experiments.study.spec import load_spec
 from sauna.experiments.study.summary import summarize
 from sauna.experiments.study.tables import unversioned
@@ -33,26 +34,39 @@ def selection_page() -> str | None:
         return None
     screens = [results for name, results in found.items() if name in SCREENS]
     pilots = [results for name, results in found.items() if name in PILOTS]
-    return page("selection", screen=_screen(screens), pilots=_pilots(pilots), points=str(POINTS))
+    return page(
+        "selection",
+        screen=_screen(screens),
+        details=_details(screens),
+        pilots=_pilots(pilots),
+        points=str(POINTS),
+    )
 
 
 def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
     if not studies:
         return "The screen has not been trained yet."
+    cells = _cells(studies)
+    return "\n\n".join(
+        [
+            "## The screen: rule by task",
+            f"{_seeds(studies).capitalize()} of each arm. A cell shows the word at equal env steps "
+            "and the probability of improvement over `ppo`, then the learner compute that the arm "
+            "takes to reach PPO's final return, then what else a reader has to know "
+            "([how to read it](#how-to-read-the-tables)).",
+            _table(cells, _shown, controls=False),
+            folded("The matched random controls", _table(cells, _shown, controls=True)),
+        ]
+    )
+
+
+def _details(studies: Sequence[Mapping[str, Any]]) -> str:
+    """What follows from the screen's table, and every arm behind it."""
+    if not studies:
+        return ""
     planned = planned_of(map(load_spec, SCREENS))
     summaries = [(results, summarize(results)) for results in studies]
-    cells = {
-        key: cell
-        for results, summary in summaries
-        for key, cell in words_of(results, summary).items()
-    }
     parts = [
-        "## The screen: rule by task",
-        f"{_seeds(studies).capitalize()} of each arm. A cell shows the word at equal env steps and "
-        "the probability of improvement over `ppo`, then the learner compute that the arm takes to "
-        "reach PPO's final return, then what else a reader has to know.",
-        _table(cells, controls=False),
-        folded("The matched random controls", _table(cells, controls=True)),
         "## What the tests decide",
         stage_text(stage_of(studies, planned)),
         "## Standing after the screen so far",
@@ -63,17 +77,69 @@ def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def _table(cells: Mapping[tuple[str, str], Cell], controls: bool) -> str:
-    """Tabulates rule by task, of rules or of controls."""
-    tasks = list(dict.fromkeys(task for _, task in cells))
+def _cells(studies: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Cell]:
+    """What the screen has found of each arm and task."""
+    found: dict[tuple[str, str], Cell] = {}
+    for results in studies:
+        found |= words_of(results, summarize(results))
+    return found
+
+
+def _table(
+    cells: Mapping[tuple[str, str], Cell],
+    shown: Callable[[Cell, str], str],
+    controls: bool,
+    prefix: str = "",
+) -> str:
+    """Tabulates rule by task, of rules or of controls.
+
+    Args:
+      shown: writes a cell, from it and the address of what is behind it.
+      prefix: path from the page that shows the table to this study's page.
+    """
+    links = {task: f"{prefix}#{_anchor(task)}" for _, task in cells}
     labels = dict.fromkeys(label for label, _ in cells if is_control(label) == controls)
-    head = ["Rule", *(f"[{_short(task)}](#{_anchor(task)})" for task in tasks)]
-    none = Cell("", "-")
+    head = ["Rule", *(f"[{_short(task)}]({link})" for task, link in links.items())]
     rows = [
-        [f"`{label}`", *(cells.get((label, task), none).shown for task in tasks)]
+        [
+            f"`{label}`",
+            *(
+                shown(cells[label, task], link) if (label, task) in cells else "-"
+                for task, link in links.items()
+            ),
+        ]
         for label in labels
     ]
     return markdown([head, *rows])
+
+
+def _shown(cell: Cell, link: str) -> str:
+    return cell.shown
+
+
+def glance() -> str:
+    """Tabulates rule by task in two words a cell, for the first page; says so if there is none."""
+    studies = [results for name in SCREENS if (results := load(name))]
+    if not studies:
+        return "The screen has not been trained yet."
+
+    cells = _cells(studies)
+    return _table(with_controls(cells), _words, controls=False, prefix="selection.md")
+
+
+def with_controls(cells: Mapping[tuple[str, str], Cell]) -> dict[tuple[str, str], Cell]:
+    """Says of each rule that is better at equal compute if its random control is, too."""
+    found = dict(cells)
+    for (label, task), cell in cells.items():
+        control = cells.get((label + RANDOM_CONTROL, task))
+        if control is not None and cell.compute == control.compute == "better":
+            found[label, task] = cell._replace(compute="better, as its control")
+    return found
+
+
+def _words(cell: Cell, link: str) -> str:
+    both = f"[{coloured(cell.word)}<br>{coloured(cell.compute)}]({link})"
+    return both + "<br>drops under 1%" * cell.idle
 
 
 def screen_answer() -> str | None:

@@ -25,12 +25,14 @@ from sauna.experiments.statistics import QUANTILES
 
 SAME = 0.1  # of the baseline's mean: differences up to this count as none
 COMPUTE = "samples_backward"
+ROUNDING = 1e-6  # of a ratio or a probability, by the order of additions
 
 
 class Cell(NamedTuple):
     """A rule on a task: the word at equal env steps, and all that the table shows."""
 
     word: str
+    compute: str  # the word at equal compute
     shown: str
     idle: bool = False  # it left out so little that its choice gets no credit
 
@@ -52,9 +54,10 @@ def words_of(results: Mapping[str, Any], summary: Mapping[str, Any]) -> dict[tup
                 continue
             own, other = (outcomes(c, "final_return") for c in (cell, cells[base]))
             word = word_of(improvement, own, other)
-            shown = [f"{_coloured(word)} {shown_chance(improvement[0])}"]
-            shown += [shown_ratio(ratios.get((label, task))), *marks(label, cells, base)]
-            found[label, task] = Cell(word, "<br>".join(shown), is_idle(cell))
+            ratio = ratios.get((label, task))
+            shown = [f"{coloured(word)} {shown_chance(improvement[0])}", shown_ratio(ratio)]
+            text = "<br>".join([*shown, *marks(label, cells, base)])
+            found[label, task] = Cell(word, compute_word(ratio), text, is_idle(cell))
     return found
 
 
@@ -91,6 +94,22 @@ def word_of(improvement: Sequence[float | None], own: np.ndarray, base: np.ndarr
     return "same" if max(map(abs, limits)) <= SAME * abs(base.mean()) else "not decided"
 
 
+def compute_word(ratio: Sequence[float | None] | None) -> str:
+    """Chooses better, worse, not decided or not reached; a dash if no compute is recorded.
+
+    Args:
+      ratio: the compute to PPO's final return, of PPO's, and its interval. Below 1 is better.
+    """
+    if ratio is None:
+        return "-"
+    value, low, high = ratio
+    if value is None:
+        return "not reached"
+    if high is not None and high < 1 - ROUNDING:
+        return "better"
+    return "worse" if low is not None and low > 1 + ROUNDING else "not decided"
+
+
 def difference_interval(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
     """Computes Welch's 95% interval of the difference of two means."""
     if np.ptp(x) == np.ptp(y) == 0:
@@ -103,8 +122,13 @@ def difference_interval(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 def shown_chance(value: float) -> str:
     """Writes a probability with as many digits as show on which side of one half it lies."""
+    return _beside(0.5, value)
+
+
+def _beside(limit: float, value: float) -> str:
+    """Writes a number with two digits, or as many as show on which side of a limit it lies."""
     digits = 2
-    while float(text := f"{value:.{digits}f}") == 0.5 and value != 0.5:
+    while float(text := f"{value:.{digits}f}") == limit and abs(value - limit) > ROUNDING:
         digits += 1
     return text
 
@@ -125,9 +149,11 @@ def shown_ratio(ratio: Sequence[float | None] | None) -> str:
     value, low, high = ratio
     if value is None:
         return "not reached"
-    ends = "" if low is None else f" [{low:.2f}, {'-' if high is None else f'{high:.2f}'}]"
-    return f"x {value:.2f}{ends}"
+    if low is None:
+        return f"x {value:.2f}"
+    return f"x {value:.2f} [{_beside(1, low)}, {'-' if high is None else _beside(1, high)}]"
 
 
-def _coloured(word: str) -> str:
-    return f'<span class="{word.replace(" ", "-")}">{word}</span>'
+def coloured(word: str) -> str:
+    """Writes a word in the colour that the site gives it."""
+    return f'<span class="{word.replace(",", "").replace(" ", "-")}">{word}</span>'

@@ -9,7 +9,7 @@ from typing import Any
 
 from claims import HEADER, Count, claims_rows, count, sentences, short_answer
 from measured_pages import noise_answer, posture_answer, sweep_answer
-from selection_page import screen_answer
+from selection_page import glance, screen_answer
 from studies import (
     CLAIMED,
     FILES,
@@ -87,6 +87,7 @@ def index(covered: float) -> str:
     head = ["Study", "Tasks", "Seeds", "Env steps", "Command"]
     return page(
         "index",
+        glance=glance(),
         findings=findings(""),
         studies=markdown([head, *map(_scope, _all())]),
         covered=f"{covered:.0%}",

@@ -10,9 +10,11 @@ import selection_page
 from selection_arms import arms, share_to_level
 from selection_trainings import seeds_said
 from selection_words import (
+    compute_word,
     difference_interval,
     shown_chance,
     shown_improvement,
+    shown_ratio,
     word_of,
     words_of,
 )
@@ -91,11 +93,55 @@ def test_the_answer_counts_tasks_and_rules(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(selection_page, "planned_of", lambda specs: planned)
     answer = selection_page.screen_answer()
     assert answer is not None
-    assert answer.startswith("**not decided** after 5 seeds on 1 of 8 tasks and")
-    assert "on 1 of 8 tasks and a part of 1 more. By the intervals" in answer
+    whole = "All rules are trained on 1 of 8 tasks, some on 1 more, with 5 seeds."
+    assert answer.startswith(f"**not decided**. {whole} By the intervals")
     assert "better on a task: `high`, and 1 of 2 scored worse on a task" in answer
     planned["untrained", "CartPole-v1"] = 5  # a rule that no task has yet counts, too
-    assert "on 0 of 8 tasks and a part of 2 more" in (selection_page.screen_answer() or "")
+    assert "on 0 of 8 tasks, some on 2 more" in (selection_page.screen_answer() or "")
+
+
+@pytest.mark.parametrize(
+    ("ratio", "expected"),
+    [
+        (None, "-"),
+        ([None, None, None], "not reached"),
+        ([0.5, 0.3, 0.9], "better"),
+        ([0.5, 0.3, 1 - 1e-9], "not decided"),  # 1 but for the order of additions
+        ([0.5, 0.3, None], "not decided"),  # a resample never reaches it
+        ([1.5, 1.2, 2.0], "worse"),
+        ([1.5, 1.2, None], "worse"),
+        ([0.5, None, None], "not decided"),
+    ],
+)
+def test_words_at_equal_compute(ratio: list[float | None] | None, expected: str) -> None:
+    assert compute_word(ratio) == expected
+
+
+def test_a_ratio_shows_on_which_side_of_1_its_interval_ends() -> None:
+    assert shown_ratio([0.5, 0.3, 0.9996]) == "x 0.50 [0.30, 0.9996]"
+    assert shown_ratio([0.5, 0.3, 1 - 1e-9]) == "x 0.50 [0.30, 1.00]"
+    assert shown_ratio([1.5, 1.0004, None]) == "x 1.50 [1.0004, -]"
+    assert shown_ratio([0.5, None, None]) == "x 0.50"
+
+
+def test_the_first_page_shows_two_words_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selection_page, "load", lambda name: None)
+    assert selection_page.glance() == "The screen has not been trained yet."
+    high, low = BASE + 50, BASE - 50
+    cells = [cell("ppo", BASE, 1000.0), cell("spo", low), cell("kondo", high, 500.0)]
+    cells += [cell("kondo+random", low, 500.0), cell("pods", high, 500.0)]
+    cells += [cell("pods+random", high, 500.0)]
+    found = {"selection-screen-mujoco": study(*cells)}
+    monkeypatch.setattr(selection_page, "load", found.get)
+    lines = selection_page.glance().splitlines()
+    assert lines[0] == "| Rule | [A](selection.md#a) |" and len(lines) == 2 + 3
+    worse, better, alike = lines[2:]
+    assert '<span class="worse">worse</span><br><span class="not-reached">' in worse
+    assert better == (
+        '| `kondo` | [<span class="better">better</span><br><span class="better">better</span>]'
+        "(selection.md#a) |"
+    )
+    assert ">better</span><br>" in alike and ">better, as its control</span>](" in alike
 
 
 def shown(*cells: dict[str, Any]) -> dict[str, str]:
@@ -218,8 +264,9 @@ def test_the_whole_page(monkeypatch: pytest.MonkeyPatch) -> None:
     text = selection_page.selection_page()
     assert text is not None
     headings = [line for line in text.splitlines() if line.startswith("## ")]
-    assert headings[1:] == [
+    assert headings == [
         "## The screen: rule by task",
+        "## How to read the tables",
         "## What the tests decide",
         "## Standing after the screen so far",
         "## Every arm, task by task",
