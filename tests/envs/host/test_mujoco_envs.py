@@ -8,9 +8,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sauna.envs.flagrun import host, rows
+from sauna.envs.flagrun import host
 from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.physics import after_throw
+from sauna.envs.host import flagrun_rows
 from sauna.envs.host.contract import episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.host.mujoco_envs import MujocoEnvs
@@ -87,7 +88,7 @@ def test_the_flag_run_equals_its_own_environment(monkeypatch) -> None:
         monkeypatch.setattr(rules, name, value)
     thrown = []
     throw = lambda *arguments: thrown.append(1) or after_throw(*arguments)  # noqa: E731
-    for module in (host, rows):
+    for module in (host, flagrun_rows):
         monkeypatch.setattr(module, "after_throw", throw)
     assert assert_equals_gymnasium(FLAGRUN, {}, steps=190) >= 9
     assert len(thrown) > 20 and len(thrown) % 2 == 0  # as often here as there

@@ -2,7 +2,7 @@
 
 Each environment is Gymnasium's own: it makes the model, draws the resets, and replays episodes.
 Only `step` is short-circuited: `mj_step` on every environment's own `MjData`, then observations,
-rewards and ends of all of them at once; see `mujoco_tasks.py` and `flagrun/rows.py`.
+rewards and ends of all of them at once; see `mujoco_tasks.py` and `flagrun_rows.py`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.host import HumanoidFlagrunHarder
-from sauna.envs.flagrun.rows import FlagrunRows
 from sauna.envs.host.contract import Snapshot, Step
+from sauna.envs.host.flagrun_rows import FlagrunRows
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs, Slot
 from sauna.envs.host.mujoco_tasks import TASKS, Outcome, make_task
 from sauna.envs.info import numbers_of
