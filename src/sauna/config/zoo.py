@@ -54,7 +54,7 @@ ZOO = (
     Entry(r"BipedalWalker-v\d+", "bipedal-walker", 5_000_000, RL_ZOO),
     Entry(r"BipedalWalkerHardcore-v\d+", "bipedal-walker-hardcore", 100_000_000, RL_ZOO),
     Entry(r"CarRacing-v\d+", "car-racing", 200_000, OWN),
-    Entry(r"(?:mjx/)?Swimmer-v\d+", "swimmer", 1_000_000, RL_ZOO),
+    Entry(r"(?:mjx/)?Swimmer-v\d+", "swimmer", 1_000_000, OWN),
     Entry(r"InvertedDoublePendulum-v\d+", "inverted-double-pendulum", 1_000_000, OWN),
     Entry(r"(?:mjx/)?HalfCheetah-v\d+", "half-cheetah", 1_000_000, RL_ZOO),
     Entry(rf"(?:mjx/)?(?:{MUJOCO})-v\d+", "mujoco", 1_000_000, SCHULMAN),
