@@ -38,6 +38,20 @@ from sauna.config.accepted import over, translate
         ),
         ({"env": "a", "env_kwargs": {"n": 1}}, {"env": "b"}, {"env": "b"}),
         ({"env": "a", "env_kwargs": {"n": 1}}, {"steps": 9}, None),
+        (  # what nothing reads any more
+            {"eval_every": 9, "eval_episodes": 2, "stop_at": 5.0, "gamma": 0.9},
+            {"eval_every": "0"},
+            {"eval_every": "0", "gamma": 0.9},
+        ),
+        ({"arm": ["sauna"], "threshold": 0.8}, {"arm": "ppo"}, {"arm": "ppo"}),
+        ({"arm": ["vex-head"], "vex_coef": 0.25}, {"arm": "ppo"}, {"arm": "ppo"}),
+        (  # and what was read for its sake alone
+            {"stop": "target-kl", "stop_kwargs": {"limit": 0.01}},
+            {"algorithm": "a2c"},
+            {"algorithm": "a2c"},
+        ),
+        ({"eval_episodes": 2}, {"gamma": "0.9"}, None),  # which nothing read before: it is refused
+        ({"eval_episodes": 2}, {"eval_every": "0", "eval_episodes": "3"}, None),
     ],
 )
 def test_what_is_typed_goes_over_what_a_file_says(

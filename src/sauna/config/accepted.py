@@ -6,10 +6,12 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from sauna.config.arms import fixed_by
+from sauna.config.checks import is_read
 from sauna.config.other_names import ACCEPTED
 from sauna.config.parsing import read_value
 from sauna.config.presets import arm_config, parse_all
-from sauna.config.settings import parse
+from sauna.config.settings import FIELDS, parse
 from sauna.system.errors import BadInput
 
 
@@ -42,12 +44,32 @@ def over(stored: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
     """Puts what is typed over what a file says.
 
     `--seed` replaces its seeds and `--seeds` its seed, and so on. A rule that is typed does not get
-    the arguments of the rule in the file.
+    the arguments of the rule in the file, and what only the file's settings read is left out.
     """
     gone = [other for pair in _SAME for name, other in (pair, pair[::-1]) if name in typed]
     named = {"stop" if name == "target_kl" else name for name in typed}
     gone += [f"{name}_kwargs" for name in named if stored.get(name) != typed.get(name)]
-    return {k: v for k, v in stored.items() if k not in gone} | dict(typed)
+    found = {k: v for k, v in stored.items() if k not in gone} | dict(typed)
+    try:
+        left = set(_unread(found)) - set(_unread(stored))
+        while lost := [name for name in left if name in found and name not in typed]:
+            found = {name: value for name, value in found.items() if name not in lost}
+            left = set(_unread(found)) - set(_unread(stored))  # what was read for their sake alone
+    except BadInput:
+        pass  # the run says so
+    return found
+
+
+def _unread(values: Mapping[str, Any]) -> list[str]:
+    """Names the fields among `values` that none of the arms reads, or that all of them fix."""
+    parsed = parse_all({k: v for k, v in translate(values).items() if v is not None})
+    arms = parsed.get("arm", FIELDS["arm"].default)
+    configs = {arm: arm_config(arm, parsed) for arm in arms}
+    return [
+        name
+        for name in parsed
+        if all(name in fixed_by(arm) or not is_read(name, own) for arm, own in configs.items())
+    ]
 
 
 # A setting that is accepted, and the field that it is another form of.
