@@ -139,8 +139,12 @@ def test_the_policy_acts_as_in_training(result) -> None:
     with pytest.raises(ValueError, match="needs key"):
         policy(observation, deterministic=False)
     assert result.policy(member="sauna/0")(observation).shape == (2,)
+    assert result.policy(member=np.argmax([0.5, 2.0])).name == "sauna/1"
     with pytest.raises(BadInput, match="not between 0 and 1"):
-        result.policy(member=2)
+        result.policy(member=np.int64(2))
+    for member in (-1, 0.5, True):
+        with pytest.raises(BadInput, match="member: must be a whole number of at least 0"):
+            result.policy(member=member)
 
 
 def test_evaluation_does_not_change_the_run_and_repeats(result) -> None:

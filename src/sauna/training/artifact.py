@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sauna.config.parsing import whole_number
 from sauna.config.presets import RunConfig
 from sauna.config.settings import Config
 from sauna.config.stored import read_stored
@@ -202,9 +203,9 @@ def best_steps(artifact: Artifact, members: Sequence[str]) -> dict[str, int]:
 
 
 def find_member(members: list[str], member: str | int) -> str:
-    if isinstance(member, int) or member.isdecimal():
-        index = int(member)
-        if not 0 <= index < len(members):
+    if not isinstance(member, str) or member.isdecimal():
+        index = whole_number("member", member, 0)  # perhaps numpy's, such as of argmax
+        if index >= len(members):
             raise BadInput(f"member: {index} is not between 0 and {len(members) - 1}")
         return members[index]
     if member not in members:
