@@ -57,6 +57,14 @@ def test_it_acts_and_plays_as_its_member(run: Path, policy: Path) -> None:
     assert stored["env_steps"] == 64 and stored["members"] == ["ppo/1"]
 
 
+def test_a_link_to_a_run_is_evaluated_as_the_run(run: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(run)
+    how = {"episodes": 1, "deterministic": True, "seed": 5}
+    assert sauna.evaluate(link, **how) == sauna.evaluate(run, **how)
+    assert (link / "evaluation_deterministic.json").is_file()
+
+
 def test_nothing_of_the_user_is_in_it(run: Path, policy: Path) -> None:
     names = {str(path.relative_to(policy)) for path in policy.rglob("*") if path.is_file()}
     written = {"evaluation_deterministic.json"}  # by the test above

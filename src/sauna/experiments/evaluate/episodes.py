@@ -129,7 +129,8 @@ def evaluate(
         progress.say_cut(max_steps)
     close(made)
     if env is None and member is None and checkpoint is None and not env_kwargs:
-        own_folder(written)
+        if written != run:  # which may be a link that the user gave
+            own_folder(written)
         run_directory.write_json(written / f"evaluation_{'best_' * best}{mode}.json", result)
     if video:
         label = f"{chosen[0].replace('/', '-')}_{'best_' * best}{mode}" + f"_{checkpoint}" * (
