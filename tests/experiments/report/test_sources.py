@@ -49,6 +49,13 @@ def write_run(path: Path, arms: tuple[str, ...] = ("ppo", "sauna")) -> Path:
     return path
 
 
+def test_a_csv_file_with_excels_mark_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "marked.csv"
+    path.write_bytes(b"\xef\xbb\xbfstep,return\n10,1.5\n20,2.5\n")
+    [source] = read_sources([path])
+    np.testing.assert_array_equal(source.seeds[0].x, [10, 20])
+
+
 def test_a_csv_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_text(

@@ -145,7 +145,7 @@ def _read_csv(path: Path) -> list[Source]:
     """The arms (all is one without a column `arm`) and seeds of a CSV file, without # lines."""
     points: dict[str, dict[int, list[tuple[float, float]]]] = {}
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # Excel's begins with a mark
             reader = csv.DictReader(line for line in file if not line.startswith("#"))
             names = reader.fieldnames or []
             step, value = _column(path, names, STEP_COLUMNS), _column(path, names, RETURN_COLUMNS)
