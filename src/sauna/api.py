@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from sauna.config.accepted import translate
@@ -149,8 +149,6 @@ def train(
       SaunaError: training failed; the last good checkpoint is on disk.
     """
     given = {"env": _env_name(env), **{n: _named(n, v) for n, v in settings.items()}}
-    if given.get("out") is not None:
-        given["out"] = str(given["out"])
     picked = pick(given)
     overrides = translate(picked.overrides)
     display: Display = _Silent() if quiet else make_display()
@@ -303,7 +301,9 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named(name: str, value: Any) -> Any:
-    """Names a part that was passed by value; other values stay."""
+    """Names a part that was passed by value, and a path; other values stay."""
+    if isinstance(value, PurePath):
+        return str(value)
     if name in ("track", "wrap") and value is not None and not isinstance(value, str):
         return [name_of(one) for one in (value if isinstance(value, list | tuple) else [value])]
     return name_of(value) if name in PARTS and value is not None else value

@@ -91,12 +91,21 @@ def test_the_best_evaluation_is_exported(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_new_run_starts_from_it(run: Path, policy: Path, tmp_path: Path) -> None:
-    settings = {**SMALL, "processes": 1, "steps": 32, "init_from": str(policy)}
+    settings = {**SMALL, "processes": 1, "steps": 32, "init_from": policy}
     sauna.train("InvertedPendulum-v5", quiet=True, out=tmp_path / "new", **settings)
     initial = load_initial(tmp_path / "new", load_artifact(tmp_path / "new").config)
     expected = load_artifact(policy).checkpoint.arrays
     for name in ("params/policy_head/kernel", "observation_moments/mean"):
         np.testing.assert_array_equal(initial[f"ppo/0/{name}"], expected[f"ppo/1/{name}"])
+    stored = run_directory.read_config(tmp_path / "new")
+    run_directory.write_config(tmp_path / "new", {**stored, "extended": [{"steps": 16}]})
+    tuned = sauna.export(tmp_path / "new", tmp_path / "tuned", episodes=0)
+    for again in (tuned, sauna.export(tuned, tmp_path / "again", episodes=0)):
+        card = (again / "README.md").read_text()
+        assert "It began with the weights of another run" in card and str(policy) not in card
+        assert "first to have 16 env steps" in card
+    card = (policy / "README.md").read_text()  # of a run from new weights
+    assert "It began" not in card and "first to have" not in card
 
 
 def test_a_path_that_it_started_from_is_left_out(tmp_path: Path) -> None:

@@ -60,6 +60,7 @@ FORMS = {
     "policy.onnx": "`policy.onnx` is the same policy, from the raw observation to the action.",
     "numpy/policy.py": "`numpy/` is the same in a file that needs numpy and safetensors alone.",
 }
+BEGAN = {"weights": "the weights of another run", "clone": "a clone of recorded episodes"}
 FILES = {
     "README.md": "the model card",
     "policy.json": "settings, spaces, versions",
@@ -144,8 +145,14 @@ def _returns(manifest: Mapping[str, Any]) -> str:
 
 
 def _trained(manifest: Mapping[str, Any]) -> str:
+    training = manifest["training"]
     parts = [f"```bash\n{command(manifest)}\n```"]
-    returns = manifest["training"].get("returns", {})
+    if began := BEGAN.get(str(training.get("began"))):
+        parts.append(f"It began with {began}, which this command leaves out (`--init-from`).")
+    if earlier := [n for n in training.get("steps_before", ()) if type(n) is int]:
+        first = ", then ".join(f"{steps:,}" for steps in earlier)
+        parts.append(f"The run was first to have {first} env steps, and got more on a resume.")
+    returns = training.get("returns", {})
     if returns:
         rows = "\n".join(f"| `{_code(name)}` | {value:.2f} |" for name, value in returns.items())
         parts.append(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
+from sauna.config.checks import is_read
 from sauna.config.imported_from import names_the_folder
 from sauna.config.plugins import provide
 from sauna.config.settings import FIELDS, fields_with
@@ -159,7 +160,7 @@ def _manifest(run: Path, artifact: Artifact, name: str, best: bool) -> dict[str,
         steps, training = before["env_steps"], before.get("training", {})
     else:
         steps = _steps(artifact, name, best)
-        training = _training(run)
+        training = _training(run, artifact)
     return {
         "format": EXPORT_FORMAT,
         **to_stored(artifact.run.replace(**usual)),
@@ -179,13 +180,19 @@ def _steps(artifact: Artifact, name: str, best: bool) -> int:
     return int(artifact.checkpoint.arrays[f"{name}/counters/env_steps"])
 
 
-def _training(run: Path) -> dict[str, Any]:
-    """The run's revision and how all of its members ended: the policy is one of them."""
+def _training(run: Path, artifact: Artifact) -> dict[str, Any]:
+    """The run's revision, its beginning and how its members ended: the policy is one of them."""
     stored = run_directory.read_config(run)
     members = len(stored["config"].get("arm", [])) * len(stored["config"].get("seeds", []))
     last = last_rows(run / "metrics.jsonl", members)
     returns = {name: row["return_mean"] for name, row in last.items() if "return_mean" in row}
-    return {"git": stored.get("git"), "returns": dict(sorted(returns.items()))}
+    found = {"git": stored.get("git"), "returns": dict(sorted(returns.items()))}
+    if artifact.config.init_from:  # but not its path, which may be one of the user's
+        found["began"] = "clone" if is_read("clone_epochs", artifact.config) else "weights"
+    before = [one.get("steps") for one in stored.get("extended", []) if isinstance(one, dict)]
+    if earlier := sorted({n for n in before if type(n) is int} - {artifact.config.steps}):
+        found["steps_before"] = earlier
+    return found
 
 
 def _state(artifact: Artifact, name: str, best: bool) -> bytes:
