@@ -12,7 +12,7 @@ import pytest
 import sauna
 from faults.canned import BACKENDS
 from helpers import SMALL, equal, make_job, train_here
-from sauna.config.presets import Member
+from sauna.config.presets import Member, resolve_run
 from sauna.config.settings import Config
 from sauna.system import checkpoint, run_directory
 from sauna.system.checkpoint import under
@@ -158,6 +158,18 @@ def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> No
 @pytest.mark.parametrize(("env", "matters"), [("CartPole-v1", False), ("Pendulum-v1", True)])
 def test_how_actions_are_rescaled_matters_to_continuous_ones_alone(env: str, matters: bool) -> None:
     assert _matters("rescale_actions", prepare({"env": env, **SETTINGS})) == matters
+
+
+def test_the_first_log_std_is_that_of_the_run(trained) -> None:
+    """Its own would be read by nothing; that of a clone is where the clone begins."""
+    env, run = trained
+    common = {"env": env, "preset": "mujoco", "log_std_init": 1.0}
+    with pytest.raises(BadInput, match="log_std_init: not read by arm ppo; .* no init_from RUN"):
+        resolve_run({**common, "init_from": str(run)})
+    for text in ("", "data:episodes.parquet"):
+        assert resolve_run({**common, "init_from": text}).config.log_std_init == 1.0
+    found = under("ppo/0/params/log_std", final(run))
+    assert equal(under("ppo/0/params/log_std", initial(env, run)), found)
 
 
 def test_a_foreign_run_is_refused_until_it_is_trusted(trained, tmp_path, monkeypatch) -> None:

@@ -32,7 +32,11 @@ CHOICES = (
     "Discrete or MultiDiscrete actions",
     lambda spaces: spaces.action_kind in ("discrete", "multi_discrete"),
 )
-LOG_STD = ("a distribution other than beta", lambda c: c.distribution != "beta")
+DATA = "data:"  # before recorded episodes that init_from names
+LOG_STD = (
+    "a distribution other than beta, and no init_from RUN, whose log-std is taken over",
+    lambda c: c.distribution != "beta" and (not c.init_from or c.init_from.startswith(DATA)),
+)
 GSDE = ("distribution gsde", lambda c: c.distribution == "gsde")
 UNBOUNDED = (
     "distribution gaussian or gsde: the others are stretched to the bounds by themselves",
@@ -91,6 +95,5 @@ def moved_by(config: Any) -> list[str]:
 SCHEDULED = ("a schedule of the budget, or a warm-up", lambda c: bool(moved_by(c)))
 EVALUATED = ("eval_every above 0", lambda c: c.eval_every > 0)
 FINE_TUNED = ("init_from", lambda c: bool(c.init_from))
-DATA = "data:"  # before recorded episodes that init_from names
 CLONED = ("init_from data:...", lambda c: c.init_from.startswith(DATA))
 AUXILIARY = ("an auxiliary head", lambda c: c.auxiliary != "none")
