@@ -164,7 +164,7 @@ def test_the_first_log_std_is_that_of_the_run(trained) -> None:
     """Its own would be read by nothing; that of a clone is where the clone begins."""
     env, run = trained
     common = {"env": env, "preset": "mujoco", "log_std_init": 1.0}
-    with pytest.raises(BadInput, match="log_std_init: not read by arm ppo; .* no init_from RUN"):
+    with pytest.raises(BadInput, match=r"log_std_init: not read by .* no init_from RUN"):
         resolve_run({**common, "init_from": str(run)})
     for text in ("", "data:episodes.parquet"):
         assert resolve_run({**common, "init_from": text}).config.log_std_init == 1.0

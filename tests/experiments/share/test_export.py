@@ -108,6 +108,17 @@ def test_a_new_run_starts_from_it(run: Path, policy: Path, tmp_path: Path) -> No
     assert "It began" not in card and "first to have" not in card
 
 
+def test_numbers_are_read_as_on_the_command_line(tmp_path: Path) -> None:
+    own, to = zoo()["CartPole-v1"], tmp_path / "x"
+    for name, value in (("episodes", 1.5), ("episodes", -1), ("seed", "x"), ("seed", True)):
+        with pytest.raises(BadInput, match=f"{name}: must be a whole number of at least 0"):
+            sauna.export(own, to, **{name: value})
+    assert not to.exists()
+    sauna.export(own, to, episodes=np.int64(1), seed=np.int64(7))
+    played = run_directory.read_config(to, exported=True)["evaluation"]
+    assert (played["episodes"], played["seed"]) == (1, 7)
+
+
 def test_a_path_that_it_started_from_is_left_out(tmp_path: Path) -> None:
     own = zoo()["CartPole-v1"]
     stored = run_directory.read_config(own, exported=True)

@@ -14,6 +14,7 @@ from safetensors.numpy import save
 
 from sauna.config.checks import is_read
 from sauna.config.imported_from import names_the_folder
+from sauna.config.parsing import whole_number
 from sauna.config.plugins import provide
 from sauna.config.settings import FIELDS, fields_with
 from sauna.config.stored import to_stored
@@ -90,8 +91,7 @@ def export(
         be written as asked; nothing was created.
     """
     folder = check_empty(Path.cwd() / to)
-    if episodes < 0 or seed < 0:
-        raise BadInput("episodes: must be at least 0, as seed")
+    episodes, seed = whole_number("episodes", episodes, 0), whole_number("seed", seed, 0)
     path = locate(run).folder
     artifact = load_artifact(path, say, trust=trust)
     name = find_member(artifact.members, member)
