@@ -96,6 +96,12 @@ BAD = [
     (["train", ENV, "--target-kl", "0.01", "--stop", "espo"], "either target_kl or stop"),
     (["train", ENV, "--target-kl", "0.01", "--algorithm", "a2c"], "target_kl: only read"),
     (["train", ENV, "--eval-every", "512", "--stop-at", "x"], "stop_at: cannot read 'x' as a num"),
+    (
+        ["train", ENV, "--eval-every", "512", "--stop-at", "-1e3", "--steps", "9"],
+        "steps: 9 is less",
+    ),
+    (["train", ENV, "--log-std-init", "-.5E-1", "--steps", "9"], "steps: 9 is less"),
+    (["train", ENV, "--stop-at", "-x"], "expected one argument"),
     (["train", ENV, "--optimizer", "adamv"], "did you mean 'adam'"),
     (["train", ENV, "--kl-threshold", "0.01"], "here it is '--desired-kl'"),
     (

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -62,6 +63,10 @@ _PLACE: dict[str, dict[str, Any]] = {
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-\.?\d")  # -1e3, too, as from Python 3.14 on
+
     def error(self, message: str) -> NoReturn:
         raise BadInput(message)
 
