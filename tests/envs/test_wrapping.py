@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ from sauna.envs.device.stacked import stacked
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
 from sauna.envs.make import in_process_envs, make_env
 from sauna.envs.masked import MaskedEnv
-from sauna.envs.spaces import describe
+from sauna.envs.spaces import describe, difference, read_spaces
 from sauna.envs.stacked import StackedEnv, StackedSpace
 from sauna.envs.wrapping import Wrapping, read_wrapping
 from sauna.system.errors import BadInput
@@ -58,6 +59,16 @@ def test_wrapped_environments_can_be_copied() -> None:
     for env in (StackedEnv(Finite(), 3), MaskedEnv(Finite())):
         again = copy.deepcopy(env)
         assert again.observation_space == env.observation_space
+
+
+def test_a_learner_sees_a_stack_as_any_box_of_its_shape() -> None:
+    """Of a dataset, which holds a plain box, and of a policy that was trained on one."""
+    action, one = gym.Discrete(2), gym.Box(-1, 1, (3,), np.float32)
+    stack = describe(StackedSpace(one, action, 3), action)
+    box, other = (describe(gym.Box(-np.inf, np.inf, (n,)), action) for n in (9, 8))
+    assert difference(box, stack) == "" and difference(other, stack)
+    before = stack._replace(observation_structure=("StackedSpace", 9))
+    assert read_spaces(json.loads(json.dumps(before))) == stack
 
 
 def test_the_device_stacks_as_the_host_does() -> None:

@@ -119,6 +119,9 @@ def read_spaces(values: list[Any]) -> Spaces:
       TypeError, ValueError: they are none.
     """
     spaces = Spaces(*map(_tuples, values))
+    parts = spaces.observation_structure
+    if isinstance(parts, tuple) and parts[:1] == ("StackedSpace",):  # of runs from before
+        spaces = spaces._replace(observation_structure=("Box", *parts[1:]))
     for sizes in (spaces.observation_shape, spaces.action_sizes):
         if not isinstance(sizes, tuple) or not all(
             type(n) is int and 0 <= n < 2**31 for n in sizes
@@ -185,7 +188,8 @@ def _structure(space: Any) -> tuple[Any, ...]:
         return ("Discrete", int(space.n))
     if isinstance(space, gym.MultiDiscrete):
         return ("MultiDiscrete", *map(int, space.nvec.ravel()))
-    return (type(space).__name__, *map(int, space.shape or ()))
+    kind = "Box" if isinstance(space, gym.Box) else type(space).__name__  # a stack is one, too
+    return (kind, *map(int, space.shape or ()))
 
 
 def describe(observation_space: Any, action_space: Any) -> Spaces:
