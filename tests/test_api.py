@@ -139,6 +139,8 @@ def test_the_policy_acts_as_in_training(result) -> None:
     with pytest.raises(ValueError, match="needs key"):
         policy(observation, deterministic=False)
     assert result.policy(member="sauna/0")(observation).shape == (2,)
+    with pytest.raises(BadInput, match="unknown argument 'chekpoint'"):
+        sauna.load(result.path, chekpoint=2)
     assert result.policy(member=np.argmax([0.5, 2.0])).name == "sauna/1"
     with pytest.raises(BadInput, match="not between 0 and 1"):
         result.policy(member=np.int64(2))

@@ -284,6 +284,9 @@ def load(
       best: as it was at its best evaluation during training (`eval_every`).
       trust: the code that the run names may run, even if another user named it.
       **parts: those that were passed by value when the run started (`env`, `network`, ...).
+
+    Raises:
+      BadInput: there is no such run, member or checkpoint, or an argument is unknown.
     """
     from sauna.experiments.evaluate.policy import TrainedPolicy
     from sauna.training.artifact import load_artifact
@@ -291,7 +294,8 @@ def load(
 
     folder = locate(path).folder
     artifact = load_artifact(folder, iteration=checkpoint, trust=trust)
-    provide(folder, parts, PARTS)
+    if rest := provide(folder, parts, PARTS):
+        raise BadInput(f"unknown argument {next(iter(rest))!r}")
     return TrainedPolicy(artifact, member, best=best)
 
 
