@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+import numpy as np
 import pytest
 
 from sauna.config import presets
@@ -87,3 +89,12 @@ def test_every_choice_that_has_a_name_has_a_help_line() -> None:
     assert set(presets.FILTER_HELP) == set(FILTERS) and set(presets.TARGET_HELP) == set(VEX_TARGETS)
     assert set(presets.ARM_HELP) == set(presets.ARMS)
     assert set(presets.PRESET_HELP) == set(presets.PRESETS)
+
+
+@pytest.mark.parametrize("number", [3, "3", 3.0, np.int64(3), np.array(3)[()]])
+def test_a_number_of_seeds_may_be_numpys(number: Any) -> None:
+    assert parse("seeds", number) == (0, 1, 2)
+    assert parse("seeds", np.arange(4, 6)) == parse("seeds", range(4, 6)) == (4, 5)
+    for bad in (None, True, iter([1]), np.float64(1.5)):
+        with pytest.raises(BadInput, match="seeds: cannot read"):
+            parse("seeds", bad)

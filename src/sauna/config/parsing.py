@@ -66,7 +66,7 @@ def _seeds(value: Any) -> tuple[int, ...]:
     """Reads a count (`6`, `"6"`: seeds 0 to 5) or the seeds themselves (a list, `"100,101"`)."""
     if isinstance(value, str) and "," in value:
         value = [part for part in value.split(",") if part.strip()]
-    if isinstance(value, str | int | float):
+    if isinstance(value, str) or not hasattr(value, "__len__"):  # also a number of numpy
         number = _integer(value)
         if number > MAX_SEEDS:
             raise BadInput(

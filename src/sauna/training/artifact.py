@@ -64,6 +64,8 @@ def load_artifact(
         if iteration is not None:
             raise BadInput(f"checkpoint: {run} is an exported policy, which has one alone")
         return _artifact(_exported(run, stored), stored, trust)
+    if iteration is not None:
+        iteration = whole_number("checkpoint", iteration, 0)
     kept = [int(path.name) for path in checkpoint.numbered(run / "checkpoints")]
     if iteration is None:
         loaded = _newest(run, warn)

@@ -73,7 +73,10 @@ def test_the_same_environment_by_name_plays_the_same_episodes(run: Path, capsys)
 
 def test_any_kept_checkpoint_can_be_played_and_loaded(run: Path, capsys) -> None:
     before = run_directory.read_config_file(run / "evaluation_sampled.json")
-    first = sauna.evaluate(run, episodes=2, checkpoint=1)
+    first = sauna.evaluate(run, episodes=2, checkpoint="1")
+    for bad in ("x", -1, 1.5):
+        with pytest.raises(BadInput, match="checkpoint: must be a whole number of at least 0"):
+            sauna.load(run, checkpoint=bad)
     assert first["iteration"] == 1 and before["iteration"] == 3
     assert first["members"] != before["members"]
     assert run_directory.read_config_file(run / "evaluation_sampled.json") == before
