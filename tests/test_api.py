@@ -426,3 +426,17 @@ def test_unknown_settings_name_the_nearest() -> None:
     with pytest.raises(BadInput, match="unknown key 'treshold'; did you mean 'threshold'"):
         sauna.train(Finite, treshold=1)
     assert json.dumps(sauna.__all__) and isinstance(Finite(), gymnasium.Env)
+
+
+@pytest.mark.parametrize("how", [{"arms": "ppo,sauna"}, {"rules": "gigaflow,pods"}])
+def test_a_comparison_takes_names_in_a_text_or_in_a_list(how: dict[str, str]) -> None:
+    """Both get as far as the steps, with the same arms; a name that is none is refused whole."""
+    ((name, text),) = how.items()
+    said = []
+    for names in (text, text.split(",")):
+        with pytest.raises(BadInput, match="steps: 9 is less than one rollout") as error:
+            sauna.compare("small_envs:Scripted", steps=9, quiet=True, **{name: names})
+        said.append(str(error.value))
+    assert said[0] == said[1]
+    with pytest.raises(BadInput, match="'nope'"):
+        sauna.compare("small_envs:Scripted", quiet=True, **{name: f"{text},nope"})

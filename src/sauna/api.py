@@ -180,7 +180,7 @@ def compare(
     env: Any,
     *,
     arms: Sequence[str] | str = COMPARED,
-    rules: Sequence[str] = (),
+    rules: Sequence[str] | str = (),
     controls: bool = True,
     out: str | Path = "runs",
     processes: int = 0,
@@ -219,7 +219,7 @@ def compare(
             raise BadInput(f"{name}: other processes cannot import it; put it into a module")
     overrides = translate(overrides)
     task = overrides.pop("env")
-    arms, parsed = (arms,) if isinstance(arms, str) else tuple(arms), parse_all(overrides)
+    arms, rules, parsed = _names(arms), _names(rules), parse_all(overrides)
     chosen, is_tournament = chosen_arms(arms, rules, controls, parsed)
     spec = comparison(task, chosen, parsed, is_tournament)
     command = compare_command(task, arms, overrides, out, rules, controls)
@@ -302,6 +302,11 @@ def load(
 def _given(settings: dict[str, Any]) -> dict[str, Any]:
     """Leaves out what is None, which means not given, as in `train`."""
     return {name: value for name, value in settings.items() if value is not None}
+
+
+def _names(given: Sequence[str] | str) -> tuple[str, ...]:
+    """Names in a list, or in a text with commas between them, as `train` takes arms."""
+    return tuple(filter(None, given.split(","))) if isinstance(given, str) else tuple(given)
 
 
 def _named(name: str, value: Any) -> Any:
