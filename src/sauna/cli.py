@@ -297,7 +297,14 @@ def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
 
     stored = read_config_file(Path(file))
     check_trusted(stored, file, stored.pop("seal", None), trust)
-    return overrides_of(read_stored(stored)) if "config" in stored else stored
+    if "config" not in stored:
+        return stored
+    found = overrides_of(read_stored(stored))
+    if earlier := stored.get("extended"):  # resumed, perhaps with `--restart-schedule`
+        start = earlier[0]["schedule_start"]
+        found = {k: v for k, v in found.items() if k != "schedule_start"}
+        return found | ({"schedule_start": start} if start else {})
+    return found
 
 
 def _resume(values: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ PICKED = [
     ("LunarLanderContinuous-v3", "lunar-lander", 1_000_000, {"gae_lambda": 0.98}),
     ("BipedalWalker-v3", "bipedal-walker", 5_000_000, {"clip_range": 0.18, "envs": 32}),
     ("BipedalWalkerHardcore-v3", "bipedal-walker-hardcore", 100_000_000, {"gamma": 0.99}),
-    ("CarRacing-v3", "car-racing", 4_000_000, {"log_std_init": -2.0}),
+    ("CarRacing-v3", "car-racing", 200_000, {"distribution": "beta"}),
     ("Swimmer-v5", "swimmer", 1_000_000, {"gamma": 0.9999, "rollout_steps": 2048}),
     ("InvertedDoublePendulum-v5", "inverted-double-pendulum", 1_000_000, {"epochs": 5}),
     ("HalfCheetah-v5", "half-cheetah", 1_000_000, {"epochs": 20, "hidden": (256, 256)}),

@@ -80,6 +80,18 @@ def test_restarted_schedules_begin_where_the_run_had_ended(finished, capsys) -> 
     assert "learning_rate_schedule: anew from 192 to 384" in capsys.readouterr().out
 
 
+def test_a_new_run_with_its_settings_begins_its_schedules_at_the_start(finished: Path) -> None:
+    from sauna.cli import _overrides_in
+
+    reopened(finished, restart_schedule=True)
+    settings = _overrides_in(str(finished / "config.json"), trust=False)
+    assert settings["steps"] == 384 and "schedule_start" not in settings
+    stored = json.loads((finished / "config.json").read_text())
+    stored["extended"][0]["schedule_start"] = 64  # the user's own
+    (finished / "config.json").write_text(json.dumps(stored))
+    assert _overrides_in(str(finished / "config.json"), trust=False)["schedule_start"] == 64
+
+
 def test_what_cannot_be_extended_says_why_and_changes_nothing(finished: Path) -> None:
     before = (finished / "config.json").read_bytes()
     for changes, message in (
