@@ -37,7 +37,6 @@ WORDS = {
     "goal in 4 of its 20 episodes.",
     "gymnax/Breakout-MinAtar": "each seed settles in the first half of the training, at its own "
     "level. Sampled, the last 100 training episodes of each seed have the returns {sampled}.",
-    "Swimmer-v5": "RL Zoo's policy also sees the time that is left of an episode.",
 }
 
 
