@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from faults.canned import BACKENDS
 from helpers import SMALL, equal, make_job, train_here
 from sauna.config.presets import Member, resolve_run
 from sauna.config.settings import Config
+from sauna.experiments.study.found_runs import check_same_start
+from sauna.experiments.study.units import Unit
 from sauna.system import checkpoint, run_directory
 from sauna.system.checkpoint import under
 from sauna.system.errors import BadInput
@@ -129,6 +132,22 @@ def test_it_is_copied_so_that_a_resume_needs_no_other_run(trained, tmp_path: Pat
         sauna.resume(run, quiet=True)
     assert (run / "metrics.jsonl").read_bytes() == expected
     assert expected != (source / "metrics.jsonl").read_bytes()
+
+
+def test_a_study_does_not_take_runs_that_began_from_other_weights(trained, tmp_path: Path) -> None:
+    env, before = trained
+    source, settings = tmp_path / "source", {"env": env, "init_from": str(tmp_path / "source")}
+    shutil.copytree(before, source)
+    unit = Unit("unit", env, "ppo", (0, 1), settings)
+    check_same_start([unit], tmp_path)  # nothing is trained yet
+    with trained_here():
+        sauna.train(out=unit.run(tmp_path), quiet=True, **{**SETTINGS, **settings})
+        check_same_start([unit], tmp_path)
+        sauna.resume(source, quiet=True, steps=2 * SETTINGS["steps"])
+    with pytest.raises(BadInput, match=r"began from iteration 4 of .* has other weights now"):
+        check_same_start([unit], tmp_path)
+    shutil.rmtree(source)
+    check_same_start([unit], tmp_path)  # it holds all that it needs
 
 
 def test_what_does_not_fit_is_refused_by_its_name(trained, tmp_path: Path) -> None:

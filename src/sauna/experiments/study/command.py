@@ -26,7 +26,11 @@ from sauna.experiments.sequential import DESIGN
 from sauna.experiments.study.execute.display import StudyView
 from sauna.experiments.study.execute.executor import Executor
 from sauna.experiments.study.execute.local import LocalExecutor
-from sauna.experiments.study.found_runs import check_same_code, reopen_damaged
+from sauna.experiments.study.found_runs import (
+    check_same_code,
+    check_same_start,
+    reopen_damaged,
+)
 from sauna.experiments.study.measuring import gather_measured, items_of, measure
 from sauna.experiments.study.notes import before_training
 from sauna.experiments.study.own_arms import check_no_rule, control_of_any, with_own_arms
@@ -239,6 +243,7 @@ def _train(
         say = _silent if quiet else partial(print, flush=True)
         units = every_unit(spec, size)
         check_same_code(units, folder, accept_changed_code, say)
+        check_same_start(units, folder)
         reopen_damaged(units, folder, say)
         say(_opening(spec, place))
         for note in notes(spec):

@@ -15,6 +15,7 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import damage_of
 from sauna.training.display import counted
+from sauna.training.initial import has_moved
 
 NAMED = 5  # runs in a warning
 
@@ -62,6 +63,25 @@ def check_same_code(
             + f" (and {more} more)"
             * (more > 0)
         )
+
+
+def check_same_start(units: list[Unit], folder: Path) -> None:
+    """Refuses to take results of other beginnings for those of today's `init_from`.
+
+    Raises:
+      BadInput: naming a run that began from one which has been trained further since.
+    """
+    for unit in (part for whole in units for part in parts(whole, folder)):
+        run = unit.run(folder)
+        if not unit.settings.get("init_from") or not (run / "config.json").is_file():
+            continue
+        origin = run_directory.read_config(run).get("initial", {})
+        if has_moved(origin):
+            raise BadInput(
+                f"{run} began from iteration {origin['iteration']} of {origin['run']}, which has "
+                "other weights now; another --out trains all runs anew, "
+                f"rm -r {shlex.quote(str(run))} only this one"
+            )
 
 
 def reopen_damaged(units: list[Unit], folder: Path, say: Callable[[str], None]) -> None:
