@@ -22,6 +22,7 @@ FLOORS = (
     "envs.shapes",
     "envs.flatten",
     "envs.spaces",
+    "envs.actions",
     "envs.stacked",
     "envs.wrapping",
     "envs.device",

@@ -15,6 +15,7 @@ from sauna.config.other_names import ACCEPTED, ADVICE, SAME
 from sauna.config.parsing import many_seeds
 from sauna.config.presets import ARMS, PRESETS, overrides_of, resolve, resolve_run
 from sauna.config.settings import FIELDS, flag, parse, to_json
+from sauna.config.settings_file import settings_in
 from sauna.config.stored import read_stored, stored_config, to_stored
 from sauna.config.task_presets import TASK_PRESETS
 from sauna.system import run_directory
@@ -289,7 +290,7 @@ def test_seed_and_batch_size_replace_what_a_file_says(tmp_path) -> None:
     file = tmp_path / "settings.json"
     file.write_text(json.dumps({"env": ENV, "seeds": [1, 2], "minibatches": 4}))
     typed = {"seed": "7", "batch_size": "256"}
-    merged = translate(over(cli._overrides_in(str(file), trust=True), typed))
+    merged = translate(over(settings_in(str(file), trust=True), typed))
     assert merged == {"env": ENV, "seeds": (7,), "minibatches": 8}
 
 

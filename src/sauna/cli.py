@@ -21,9 +21,8 @@ from sauna.config.choices import LISTS, PEERS
 from sauna.config.flags import add_fields, shown_values
 from sauna.config.other_names import flag_hint, spread_hint
 from sauna.config.parsing import whole_number
-from sauna.config.presets import COMPARED, COMPARED_SEEDS, overrides_of, parse_all
+from sauna.config.presets import COMPARED, COMPARED_SEEDS, parse_all
 from sauna.config.settings import FIELDS, fields_with, flag
-from sauna.config.stored import read_stored
 from sauna.experiments.check import flags as checking
 from sauna.experiments.evaluate import MAX_STEPS
 from sauna.experiments.share import flags as sharing
@@ -263,13 +262,14 @@ def _subparser(parser: argparse.ArgumentParser, command: str | None) -> argparse
 
 def _train(values: dict[str, Any]) -> None:
     from sauna.api import train_and_draw
+    from sauna.config.settings_file import settings_in
     from sauna.training import run as runs
     from sauna.training.display import make_display
     from sauna.training.pick import pick
 
     trust = values.pop("trust")
     file, env = values.pop("config"), values.pop("env")
-    stored = _overrides_in(file, trust)
+    stored = settings_in(file, trust) if file else {}
     picked = pick(over(stored, values | ({"env": env} if env else {})))
     overrides = translate(picked.overrides)
     display = make_display()
@@ -286,25 +286,6 @@ def _train(values: dict[str, Any]) -> None:
 def _print_curve(run: Path) -> None:
     curve = run / "figures" / "learning_curve.png"
     print(f"learning curve: {curve}" if curve.exists() else "no episode has finished: no curve")
-
-
-def _overrides_in(file: str | None, trust: bool) -> dict[str, Any]:
-    """Reads the settings of a `config.json` (of a run), or of a JSON file of plain settings."""
-    if file is None:
-        return {}
-    from sauna.config.trust import check_trusted
-    from sauna.system.run_directory import read_config_file
-
-    stored = read_config_file(Path(file))
-    check_trusted(stored, file, stored.pop("seal", None), trust)
-    if "config" not in stored:
-        return stored
-    found = overrides_of(read_stored(stored))
-    if earlier := stored.get("extended"):  # resumed, perhaps with `--restart-schedule`
-        start = earlier[0]["schedule_start"]
-        found = {k: v for k, v in found.items() if k != "schedule_start"}
-        return found | ({"schedule_start": start} if start else {})
-    return found
 
 
 def _resume(values: dict[str, Any]) -> None:

@@ -14,15 +14,9 @@ from gymnasium import spaces as gym
 from sauna.config.presets import resolve
 from sauna.config.settings import to_json
 from sauna.config.stored import stored_config
+from sauna.envs.actions import action_reader, action_writer
 from sauna.envs.device.contract import _reader, _writer
-from sauna.envs.spaces import (
-    action_reader,
-    action_writer,
-    board_of,
-    describe,
-    observation_reader,
-    read_spaces,
-)
+from sauna.envs.spaces import board_of, describe, observation_reader, read_spaces
 from sauna.system.errors import BadInput
 
 TWO = gym.Discrete(2)

@@ -93,9 +93,9 @@ def _study(run: Path) -> None:
 
 def _train(run: Path) -> None:
     """What `sauna train --config FILE` does first."""
-    from sauna.cli import _overrides_in
+    from sauna.config.settings_file import settings_in
 
-    _overrides_in(str(run / "config.json"), False)
+    settings_in(str(run / "config.json"), False)
 
 
 OPENERS = {"resume": _resume, "eval": _eval, "study": _study, "train": _train}

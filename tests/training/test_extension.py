@@ -15,6 +15,7 @@ from faults.canned import BACKENDS, Ended, Trap, go, played_back, record
 from faults.disk import Crash, watched
 from helpers import SMALL, configured
 from sauna.algorithm.types import Hypers
+from sauna.config.settings_file import settings_in
 from sauna.system import checkpoint, run_directory
 from sauna.system.errors import BadInput, SaunaError
 from sauna.training import run as runs
@@ -81,15 +82,13 @@ def test_restarted_schedules_begin_where_the_run_had_ended(finished, capsys) -> 
 
 
 def test_a_new_run_with_its_settings_begins_its_schedules_at_the_start(finished: Path) -> None:
-    from sauna.cli import _overrides_in
-
     reopened(finished, restart_schedule=True)
-    settings = _overrides_in(str(finished / "config.json"), trust=False)
+    settings = settings_in(str(finished / "config.json"), trust=False)
     assert settings["steps"] == 384 and "schedule_start" not in settings
     stored = json.loads((finished / "config.json").read_text())
     stored["extended"][0]["schedule_start"] = 64  # the user's own
     (finished / "config.json").write_text(json.dumps(stored))
-    assert _overrides_in(str(finished / "config.json"), trust=False)["schedule_start"] == 64
+    assert settings_in(str(finished / "config.json"), trust=False)["schedule_start"] == 64
 
 
 def test_what_cannot_be_extended_says_why_and_changes_nothing(finished: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from sauna.config.plugins import import_module, import_name, is_local
 from sauna.config.settings import NATIVE
+from sauna.envs.actions import stretch
 from sauna.envs.host.answers import close
 from sauna.envs.host.contract import HostEnvs
 from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
@@ -23,7 +24,6 @@ from sauna.envs.host.packages import (
     register,
 )
 from sauna.envs.host.together import group_size, is_known, maker_of, plain_maker, rows_of
-from sauna.envs.spaces import stretch
 from sauna.envs.wrapping import PLAIN, Wrapping, wrapped
 from sauna.system.errors import BadInput, nearest, one_line
 

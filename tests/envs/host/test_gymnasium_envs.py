@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from helpers import assert_same_step
+from sauna.envs.actions import action_writer
 from sauna.envs.host.contract import HostEnvs, episode_seed
 from sauna.envs.host.gymnasium_envs import EnvironmentFailure, GymnasiumEnvs
 from sauna.envs.make import env_maker, make_drawn_env
 from sauna.envs.probe import probe
-from sauna.envs.spaces import action_writer, describe, observation_reader
+from sauna.envs.spaces import describe, observation_reader
 from sauna.envs.workers import ProcessEnvs
 from sauna.system.errors import BadInput
 from small_envs import Scripted, Spaced

@@ -14,8 +14,9 @@ import pytest
 import sauna
 import small_envs
 from helpers import SMALL
+from sauna.envs.actions import action_writer
 from sauna.envs.make import make_env
-from sauna.envs.spaces import action_writer, describe
+from sauna.envs.spaces import describe
 from sauna.experiments.record import _Listener, _writer
 from sauna.system.errors import BadInput
 from sauna.system.run_directory import read_config

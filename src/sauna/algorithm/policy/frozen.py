@@ -12,9 +12,10 @@ from sauna.algorithm.policy.normalize import Moments, normalize
 from sauna.algorithm.policy.policy import Policy, make_policy
 from sauna.algorithm.types import Array
 from sauna.config.settings import Config
+from sauna.envs.actions import action_writer
 from sauna.envs.masked import MASK, OBSERVATION, flat_masks, is_masked
 from sauna.envs.shapes import batch_size, one_of
-from sauna.envs.spaces import Spaces, action_writer, observation_reader
+from sauna.envs.spaces import Spaces, observation_reader
 from sauna.envs.wrapping import wrapped_space, wrapping_of
 from sauna.system.errors import BadInput
 

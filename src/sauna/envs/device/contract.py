@@ -228,7 +228,7 @@ def _writer(space: Any, rescale: bool) -> Callable[[Array], Any]:
     """The device's twin of `spaces.action_writer`."""
     from gymnasium import spaces as gym
 
-    from sauna.envs.spaces import stretch
+    from sauna.envs.actions import stretch
 
     if isinstance(space, gym.Box):
         low, high = space.low.ravel(), space.high.ravel()

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from sauna.envs.actions import action_writer
 from sauna.envs.host.answers import close
 from sauna.envs.host.contract import HostEnvs, Snapshot, Step
 from sauna.envs.host.gymnasium_envs import LARGEST, EnvironmentFailure
-from sauna.envs.spaces import action_writer, describe, observation_reader
+from sauna.envs.spaces import describe, observation_reader
 from sauna.system.errors import one_line
 
 

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from sauna.envs.actions import action_writer
 from sauna.envs.host.answers import close, five_of, life_lost, one_number, reset_with
 from sauna.envs.host.contract import EVALUATION, HostEnvs, Snapshot, Step, episode_seed
 from sauna.envs.info import numbers_of
-from sauna.envs.spaces import action_writer, describe, observation_reader
+from sauna.envs.spaces import describe, observation_reader
 from sauna.system.errors import SaunaError, one_line
 
 LARGEST = 1e38  # of an observation or a reward: float32 and the running moments hold no more

@@ -15,9 +15,10 @@ from sauna.algorithm.policy.observation import INVALID
 from sauna.algorithm.policy.recurrent import STATES
 from sauna.config.choices import BOUNDED, NETWORKS
 from sauna.config.settings import Config
+from sauna.envs.actions import stretch
 from sauna.envs.pictures import is_bytes, is_float_picture, is_picture
 from sauna.envs.shapes import leaves, mask_in
-from sauna.envs.spaces import Spaces, board_of, describe, stretch
+from sauna.envs.spaces import Spaces, board_of, describe
 from sauna.experiments.share.graph import Graph
 from sauna.experiments.share.layers_graph import Arrays, between, cast, dense, mlp, number
 from sauna.experiments.share.picture_graph import Picture, convolved, pixels, read_picture

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sauna.envs.spaces import Spaces, action_reader, difference, seen_spaces
+from sauna.envs.actions import action_reader
+from sauna.envs.spaces import Spaces, difference, seen_spaces
 from sauna.system.errors import BadInput
 from sauna.training.data.masks import check_taken
 
