@@ -83,7 +83,8 @@ def make_parser(arguments: Sequence[str] = ()) -> argparse.ArgumentParser:
     text = "train a population"
     train = commands.add_parser("train", help=text, usage=usage % "train", allow_abbrev=False)
     train.add_argument("env", nargs="?", metavar="ENV", help=FIELDS["env"].metadata["help"])
-    train.add_argument("--config", metavar="FILE", help="settings of a run's config.json")
+    text = "a run, its config.json, or a JSON file of settings"
+    train.add_argument("--config", metavar="RUN|FILE", help=text)
     add_fields(train, [name for name in FIELDS if name != "env"], values)
 
     resume = commands.add_parser("resume", help="continue a run", allow_abbrev=False)

@@ -85,6 +85,7 @@ def test_a_new_run_with_its_settings_begins_its_schedules_at_the_start(finished:
     reopened(finished, restart_schedule=True)
     settings = settings_in(str(finished / "config.json"), trust=False)
     assert settings["steps"] == 384 and "schedule_start" not in settings
+    assert settings_in(str(finished), trust=False) == settings
     stored = json.loads((finished / "config.json").read_text())
     stored["extended"][0]["schedule_start"] = 64  # the user's own
     (finished / "config.json").write_text(json.dumps(stored))

@@ -1,4 +1,4 @@
-"""The settings in a file: a run's `config.json`, or plain ones that a user wrote."""
+"""The settings of a run, or in a file that a user wrote."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from sauna.system.run_directory import read_config_file
 
 
 def settings_in(file: str, trust: bool) -> dict[str, Any]:
-    """Reads the settings that a new run takes from a file.
+    """Reads the settings that a new run takes from another one, or from a file.
 
     Args:
+      file: a run directory, its `config.json`, or a JSON file of plain settings.
       trust: the code that the file names may be another user's.
 
     Raises:
       BadInput: there is no such file, or it names code of somebody else's.
     """
-    stored = read_config_file(Path(file))
+    path = Path(file)
+    stored = read_config_file(path / "config.json" if path.is_dir() else path)
     check_trusted(stored, file, stored.pop("seal", None), trust)
     if "config" not in stored:
         return stored
