@@ -25,6 +25,7 @@ WORDS = {
     "`Ant-v3` they may have been 0.",
     "BipedalWalker-v3": "RL Zoo's return is that of one policy, and its spread is over that "
     "policy's episodes. One of our three seeds lies above it.",
+    "BipedalWalkerHardcore-v3": "it was trained for 5% of RL Zoo's env steps.",
     "MiniGrid-DoorKey-5x5-v0": f"{SAMPLED} With the most likely actions, one seed does not reach "
     "the goal in 2 of its 20 episodes.",
     "MiniGrid-KeyCorridorS3R1-v0": f"{SAMPLED} With the most likely actions, one seed does not "
