@@ -35,6 +35,9 @@ MEASURED = {
     "cheetah_6_in_1": ["HalfCheetah-v5", "--processes", "1", "--rounds", "5"],
     "hopper_6": ["Hopper-v5", "--rounds", "5", "--iterations", "25"],
     "cheetah_1": ["HalfCheetah-v5", "--seeds", "1", "--against", "sb3", "--rounds", "5"],
+    "flagrun_1": shlex.split(
+        "sauna/HumanoidFlagrunHarder-v0 --preset flagrun --seeds 1 --rounds 5 --iterations 4"
+    ),
     "pong_1": [
         "ALE/Pong-v5",
         "--preset",
