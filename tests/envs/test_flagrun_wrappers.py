@@ -20,7 +20,7 @@ from sauna.envs.flagrun import ID
 from sauna.envs.flagrun import task as rules
 from sauna.envs.flagrun.host import HumanoidFlagrunHarder
 from sauna.envs.flagrun.physics import anatomy, first_qpos, load_model, read_robot
-from sauna.envs.host.gymnasium_envs import GymnasiumEnvs
+from sauna.envs.host.mujoco_envs import MujocoEnvs
 from sauna.envs.make import env_maker, in_process_envs
 from sauna.envs.probe import probe
 from sauna.system.errors import BadInput
@@ -77,7 +77,7 @@ def test_an_episode_follows_from_its_seed_and_actions() -> None:
 
 def test_a_restored_environment_goes_on_bit_for_bit() -> None:
     envs, again = (in_process_envs(ID, {}, [(3, 0)], "auto") for _ in range(2))
-    assert type(envs) is GymnasiumEnvs
+    assert type(envs) is MujocoEnvs
     rng, active = np.random.default_rng(8), np.ones(1, bool)
     actions = rng.normal(0, 0.7, (260, 1, 17)).astype(np.float32)
     envs.reset(), again.reset()
