@@ -108,7 +108,8 @@ def main() -> None:
     from sauna.config.trust import key_file, seal
 
     # The last is imported by `importlib.resources`, at its first use.
-    for module in ("sauna.cli", "sauna.experiments.study.command", "importlib.readers"):
+    ours = ("sauna.cli", "sauna.config.settings_file", "sauna.experiments.study.command")
+    for module in (*ours, "importlib.readers"):
         import_module(module)
     seal({"env": "a:b"})  # makes the key
     folders = json.loads(Path(sys.argv[1]).read_text())
