@@ -1,6 +1,6 @@
 """Writes `docs/images/car_racing.png`: a moment of CarRacing, and what preset `car-racing` sees.
 
-python results/car_racing_picture.py        needs the extra `box2d`
+`python results/car_racing_picture.py` needs the extra `box2d`.
 """
 
 from __future__ import annotations

@@ -25,6 +25,12 @@ SELECTION = (*PILOTS, *SCREENS)
 # Quantities of a curve that are committed, and points of it: there are many arms.
 CURVES = ("return_mean", "samples_backward", "learner_cpu_seconds")
 POINTS = 20
+NOTHING = "The screen has not been trained yet."
+Summarized = tuple[Mapping[str, Any], Mapping[str, Any]]  # a result file, and its summary
+
+
+def _summarized(results: Mapping[str, Any]) -> Summarized:
+    return results, summarize(results)
 
 
 def selection_page() -> str | None:
@@ -34,19 +40,20 @@ def selection_page() -> str | None:
         return None
     screens = [results for name, results in found.items() if name in SCREENS]
     pilots = [results for name, results in found.items() if name in PILOTS]
+    summaries = [*map(_summarized, screens)]
     return page(
         "selection",
-        screen=_screen(screens),
-        details=_details(screens),
+        screen=_screen(summaries),
+        details=_details(summaries),
         pilots=_pilots(pilots),
         points=str(POINTS),
     )
 
 
-def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
-    if not studies:
-        return "The screen has not been trained yet."
-    cells = _cells(studies)
+def _screen(summaries: Sequence[Summarized]) -> str:
+    if not summaries:
+        return NOTHING
+    studies, cells = [results for results, _ in summaries], _cells(summaries)
     return "\n\n".join(
         [
             "## The screen: rule by task",
@@ -60,12 +67,11 @@ def _screen(studies: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def _details(studies: Sequence[Mapping[str, Any]]) -> str:
+def _details(summaries: Sequence[Summarized]) -> str:
     """What follows from the screen's table, and every arm behind it."""
-    if not studies:
+    if not summaries:
         return ""
-    planned = planned_of(map(load_spec, SCREENS))
-    summaries = [(results, summarize(results)) for results in studies]
+    planned, studies = planned_of(map(load_spec, SCREENS)), [results for results, _ in summaries]
     parts = [
         "## What the tests decide",
         stage_text(stage_of(studies, planned)),
@@ -77,11 +83,11 @@ def _details(studies: Sequence[Mapping[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def _cells(studies: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Cell]:
+def _cells(summaries: Iterable[Summarized]) -> dict[tuple[str, str], Cell]:
     """What the screen has found of each arm and task."""
     found: dict[tuple[str, str], Cell] = {}
-    for results in studies:
-        found |= words_of(results, summarize(results))
+    for results, summary in summaries:
+        found |= words_of(results, summary)
     return found
 
 
@@ -121,9 +127,8 @@ def glance() -> str:
     """Tabulates rule by task in two words a cell, for the first page; says so if there is none."""
     studies = [results for name in SCREENS if (results := load(name))]
     if not studies:
-        return "The screen has not been trained yet."
-
-    cells = _cells(studies)
+        return NOTHING
+    cells = _cells(map(_summarized, studies))
     return _table(with_controls(cells), _words, controls=False, prefix="selection.md")
 
 
@@ -146,10 +151,9 @@ def screen_answer() -> str | None:
     """Says in a sentence what the screen has found so far; None if nothing is trained."""
     studies = [results for name in SCREENS if (results := load(name))]
     cells: dict[str, dict[str, Cell]] = {}
-    for results in studies:
-        for (label, task), cell in words_of(results, summarize(results)).items():
-            if not is_control(label):
-                cells.setdefault(label, {})[task] = cell
+    for (label, task), cell in _cells(map(_summarized, studies)).items():
+        if not is_control(label):
+            cells.setdefault(label, {})[task] = cell
     if not cells:
         return None
     specs = [load_spec(name) for name in SCREENS]

@@ -46,6 +46,8 @@ def over(stored: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
     `--seed` replaces its seeds and `--seeds` its seed, and so on. A rule that is typed does not get
     the arguments of the rule in the file, and what only the file's settings read is left out.
     """
+    if not stored:
+        return dict(typed)
     gone = [other for pair in _SAME for name, other in (pair, pair[::-1]) if name in typed]
     named = {"stop" if name == "target_kl" else name for name in typed}
     gone += [f"{name}_kwargs" for name in named if stored.get(name) != typed.get(name)]

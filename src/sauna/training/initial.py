@@ -6,7 +6,7 @@ other run does not matter any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -102,18 +102,15 @@ def read_initial(
     return arrays, origin
 
 
-def has_moved(origin: Mapping[str, Any]) -> bool:
-    """Returns whether the run that a run began from has other weights by now.
+def weights_of(run: str) -> str | None:
+    """Returns the digest of the weights that a run has now; None if it is not there.
 
-    Args:
-      origin: of `read_initial`, as the run stores it. Recorded episodes and a run that is not there
-        any more have not moved.
+    Nothing is run that it names, so nobody has to trust it.
     """
-    run = Path(str(origin.get("run", "")))
-    if "sha256" not in origin or "run" not in origin or not _is_run(run):
-        return False
-    now = load_artifact(run, lambda text: None, trust=True).checkpoint.manifest["sha256"]
-    return bool(now != origin["sha256"])
+    if not _is_run(Path(run)):
+        return None
+    artifact = load_artifact(Path(run), lambda text: None, trust=True)
+    return str(artifact.checkpoint.manifest["sha256"])
 
 
 def check_fits(artifact: Artifact, prepared: Prepared) -> None:

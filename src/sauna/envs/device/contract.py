@@ -225,7 +225,7 @@ def _reader_of_choices(space: Any) -> Callable[[Any], Array]:
 
 
 def _writer(space: Any, rescale: bool) -> Callable[[Array], Any]:
-    """The device's twin of `spaces.action_writer`."""
+    """The device's twin of `actions.action_writer`."""
     from gymnasium import spaces as gym
 
     from sauna.envs.actions import stretch

@@ -39,10 +39,10 @@ class FlagrunRows(Task):
         ]
         self._seen = Seen(*map(np.stack, zip(*self._views, strict=True)))
         self._draws = np.zeros((len(envs), rules.STEP_DRAWS))
-        idle = rules.Robot(*(np.zeros((len(envs), n)) for n in (3, 4, 3, 17, 17, 2)))
-        first, _ = rules.begin(np, idle, np.zeros((len(envs), 2)))
+        first, _ = rules.begin(np, self._robots(self._seen), np.zeros((len(envs), 2)))
         self._tasks = rules.Task(*map(np.array, first))
-        self._rows, self._reward = np.arange(0), rules.Reward(*[np.zeros(0)] * 5)
+        self._rows: np.ndarray  # that the last step took, and what it gave each
+        self._reward: rules.Reward
 
     def gather(self, index: int) -> None:
         for mine, its in zip(self._tasks, self.envs[index].task, strict=True):
@@ -57,8 +57,7 @@ class FlagrunRows(Task):
             self._simulate(row, its)
         seen = Seen(*(part[rows] for part in self._seen))
         tasks = rules.Task(*(part[rows] for part in self._tasks))
-        robots = read_robot(np, self._anatomy, seen.qpos, seen.qvel, seen)
-        outcome = rules.advance(np, tasks, robots, control, self._draws[rows])
+        outcome = rules.advance(np, tasks, self._robots(seen), control, self._draws[rows])
         for mine, new in zip(self._tasks, outcome.task, strict=True):
             mine[rows] = new
         self._throw(rows, outcome.throw)
@@ -76,6 +75,9 @@ class FlagrunRows(Task):
         mujoco.mj_kinematics(self._model, data)
         for all_rows, its in zip(self._seen, self._views[row], strict=True):
             all_rows[row] = its
+
+    def _robots(self, seen: Seen) -> rules.Robot:
+        return read_robot(np, self._anatomy, seen.qpos, seen.qvel, seen)
 
     def _throw(self, rows: np.ndarray, throw: rules.Throw) -> None:
         """Puts the cubes that are thrown where they are thrown from."""

@@ -211,7 +211,7 @@ def _bounded(graph: Graph, distribution: str, width: int, x: str) -> str:
 
 
 def _action(graph: Graph, spaces: Spaces, space: Any, parameters: str, rescale: bool) -> None:
-    """The distribution's mode as the environment takes it; see `spaces.action_writer`."""
+    """The distribution's mode as the environment takes it; see `actions.action_writer`."""
     shape = tuple(space.shape or ())
     if spaces.action_kind == "continuous":
         x = _in_box(graph, space, parameters, rescale)

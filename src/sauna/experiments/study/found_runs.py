@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 from collections import Counter
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from sauna.system import run_directory
 from sauna.system.errors import BadInput
 from sauna.system.logs import damage_of
 from sauna.training.display import counted
-from sauna.training.initial import has_moved
+from sauna.training.initial import weights_of
 
 NAMED = 5  # runs in a warning
 
@@ -71,12 +72,14 @@ def check_same_start(units: list[Unit], folder: Path) -> None:
     Raises:
       BadInput: naming a run that began from one which has been trained further since.
     """
+    now = functools.cache(weights_of)  # units often share their beginning
     for unit in (part for whole in units for part in parts(whole, folder)):
         run = unit.run(folder)
         if not unit.settings.get("init_from") or not (run / "config.json").is_file():
             continue
         origin = run_directory.read_config(run).get("initial", {})
-        if has_moved(origin):
+        # Recorded episodes have no digest, and the run may be gone.
+        if "sha256" in origin and now(origin["run"]) not in (None, origin["sha256"]):
             raise BadInput(
                 f"{run} began from iteration {origin['iteration']} of {origin['run']}, which has "
                 "other weights now; another --out trains all runs anew, "
